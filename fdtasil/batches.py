@@ -1,0 +1,94 @@
+"""The minibatches of a training: which states, and which of their probes."""
+
+from collections.abc import Callable, Iterator
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from fdtasil.demonstrations import Answers, Demonstrations
+from fdtasil.loss import Minibatch
+from fdtasil.probes import Probes
+
+__all__ = ["Batches"]
+
+
+class Batches:
+    """Training data on the device, dealt out so that every epoch visits each state once.
+
+    Args:
+        demonstrations: N labelled states.
+        probes: The derivative source; None for plain behaviour cloning.
+        answers: Number of the pool -> the expert's answers; None without probes.
+        random: Draws the order.
+        device: Where the data and the minibatches are.
+
+    Attributes:
+        gain: Of the answers in use; see `Answers`.
+    """
+
+    def __init__(
+        self,
+        demonstrations: Demonstrations,
+        probes: Probes | None,
+        answers: Callable[[int], Answers] | None,
+        random: torch.Generator,
+        device: torch.device,
+    ) -> None:
+        self._observations = torch.from_numpy(demonstrations.observations).to(device)
+        self._actions = torch.from_numpy(demonstrations.actions).to(device)
+        self._random, self._device = random, device
+        self.gain = 1.0
+        self._pool: _Pool | None = None
+        if probes is not None and answers is not None:
+            self._pool = _Pool(probes, answers, len(demonstrations), random, device)
+
+    def epoch(self, number: int, batches: int) -> Iterator[Minibatch]:
+        """Deal out each state once, in `batches` minibatches of (almost) equal size."""
+        order = torch.randperm(len(self._observations), generator=self._random)
+        if self._pool is not None:
+            self.gain = self._pool.load(number)
+        for rows in order.to(self._device).tensor_split(batches):
+            observations, actions = self._observations[rows], self._actions[rows]
+            around = self._pool.deal(rows, number) if self._pool is not None else (None, None)
+            yield Minibatch(observations, actions, *around)
+
+
+class _Pool:
+    """The expert's answers around each state; a visit of the state uses the next of them."""
+
+    def __init__(
+        self,
+        probes: Probes,
+        answers: Callable[[int], Answers],
+        states: int,
+        random: torch.Generator,
+        device: torch.device,
+    ) -> None:
+        self._probes, self._ask, self._device = probes, answers, device
+        # Each state begins with another of its probes, so that a minibatch mixes all of them.
+        self._offset = torch.randint(2**31, (states, 1), generator=random).to(device)
+        self._fill(0)
+
+    def load(self, visit: int) -> float:
+        """Ask anew where a visit needs answers that the pool does not have; return the gain."""
+        if self._probes.resample:
+            pool = visit * self._used // self._numbers.shape[1]
+            if pool != self._number:
+                self._fill(pool)
+        return self._gain
+
+    def deal(self, rows: Tensor, visit: int) -> tuple[Tensor, Tensor]:
+        """Return displacements (B, used, n) and values (B, used, p, m) of the states' visit."""
+        turns = visit * self._used + torch.arange(self._used, device=self._device)
+        columns = (self._offset[rows] + turns) % self._numbers.shape[1]
+        rows = rows[:, None]
+        return self._bank[self._numbers[rows, columns]], self._values[rows, columns]
+
+    def _fill(self, number: int) -> None:
+        answers = self._ask(number)
+        self._number, self._gain = number, answers.gain
+        self._bank = torch.from_numpy(answers.displacements).to(self._device)
+        self._numbers = torch.from_numpy(np.ascontiguousarray(answers.numbers)).to(self._device)
+        self._values = torch.from_numpy(answers.values).to(self._device)
+        self._used = self._probes.used_per_visit(answers.numbers.shape[1])

@@ -1,0 +1,188 @@
+"""The same functions from a shell; every default and help text is read from them."""
+
+import inspect
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Annotated, Any, Union, get_args, get_origin
+
+import numpy as np
+import tyro
+
+from fdtasil.distilled import Distilled
+from fdtasil.environments import EnvironmentPool, resolve_horizon
+from fdtasil.errors import FdtasilError, SettingError
+from fdtasil.experts import load_expert
+from fdtasil.experts.gate import examine_expert
+from fdtasil.pipeline import distill, evaluate
+from fdtasil.rollouts import follow, rollout
+from fdtasil.seeding import episode_seeds
+
+__all__ = ["main"]
+
+ExpertPath = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="EXPERT")]
+PolicyPath = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="POLICY")]
+EnvironmentId = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ENV")]
+
+
+def inspect_expert(
+    expert: ExpertPath,
+    env: EnvironmentId,
+    /,
+    *,
+    output: str | None = None,
+    episodes: int = 5,
+    horizon: int | None = None,
+    seed: int = 0,
+) -> None:
+    """Show what an expert is: its contract with the environment, and the return it reaches.
+
+    Args:
+        expert: ONNX file.
+        env: Gymnasium id (module:Id imports the module first).
+        output: Name of the ONNX output with the actions.
+        episodes: Episodes that the return is measured over.
+        horizon: Steps after which an episode is cut; default: the environment's time limit.
+        seed: Of the episodes.
+    """
+    with EnvironmentPool(env) as pool:
+        boxes, length = pool.boxes, resolve_horizon(horizon, pool)
+        opened = load_expert(expert, boxes.observation_size, boxes.action_size, output=output)
+        starts = episode_seeds(seed, "evaluation", 0, episodes)
+        recorded = rollout(follow(opened.policy("act")), pool, starts, length)
+        visited = recorded.observations[recorded.valid]
+        spread = np.linspace(0, len(visited) - 1, 32).astype(int)
+        findings = examine_expert(opened, visited[spread], boxes)
+    returns, falls = recorded.returns, int(recorded.terminated.sum())
+    rows = [
+        ("expert", expert),
+        ("sha256", opened.sha256),
+        ("environment", pool.name),
+        ("observations", boxes.observation_size),
+        ("actions", f"{boxes.action_size}, from {boxes.low.min():g} to {boxes.high.max():g}"),
+        ("analytic", "a torch twin agrees with it" if opened.module else "not available"),
+        *((f.name, f"{'FAILED: ' if f.problem else ''}{f.measured}") for f in findings),
+        ("return", f"{returns.mean():.1f} +- {returns.std():.1f} over {episodes} episodes"),
+        ("ended early", f"{falls} of {episodes}, of at most {length} steps"),
+    ]
+    print("\n".join(f"{name:20}{value}" for name, value in rows))
+    problem = next((finding.problem for finding in findings if finding.problem), None)
+    if problem:
+        raise problem
+
+
+def _distill(out: Path, compare: bool, **arguments: Any) -> None:
+    result = distill(**arguments)
+    result.save(out)
+    print(_side_by_side(result, distill(**{**arguments, "probes": 0}) if compare else None))
+    asked = ", ".join(f"{name} {rows:,}" for name, rows in result.queries.items() if rows)
+    print(f"rows asked of the expert: {asked}")
+    print(f"saved in {out}: student.onnx, student.safetensors, report.json, figures/, ...")
+
+
+def _evaluate(**arguments: Any) -> None:
+    print(evaluate(**arguments))
+
+
+def _side_by_side(result: Distilled, cloning: Distilled | None) -> str:
+    """Return a table of expert, plain cloning and student."""
+    ours = result.evaluation
+    lines = [
+        f"{result.report['env']}, {ours.episodes} paired episodes of {ours.horizon} steps",
+        f"{'':15}{'return':>10}{'normalised':>12}{'95 % interval':>18}{'survival':>10}",
+        f"{'expert':15}{ours.expert_return:10.1f}{1:12.3f}{'':18}{ours.expert_survival:10.2f}",
+    ]
+    students = {"plain cloning": cloning, "student": result}
+    for name, one in students.items():
+        if one is not None:
+            e = one.evaluation
+            interval = f"[{e.ci95[0]:.3f}, {e.ci95[1]:.3f}]"
+            lines.append(
+                f"{name:15}{e.student_return:10.1f}{e.normalized_return:12.3f}"
+                f"{interval:>18}{e.survival:10.2f}"
+            )
+    return "\n".join(lines)
+
+
+def as_command(
+    function: Callable[..., Any],
+    run: Callable[..., None],
+    shell_types: dict[str, Any],
+    added: dict[str, tuple[Any, Any, str]],
+) -> Callable[..., None]:
+    """Return `run` as a command with the arguments, defaults and help texts of `function`.
+
+    Args:
+        function: Whose signature and docstring are read.
+        run: Called with the parsed arguments.
+        shell_types: Types of those arguments that a shell can't express as `function` takes
+            them, by name.
+        added: Type, default and help text of arguments that only the command has.
+    """
+
+    def command(**arguments: Any) -> None:
+        run(**arguments)
+
+    parameters = [
+        _shell_parameter(parameter, shell_types)
+        for name, parameter in inspect.signature(function).parameters.items()
+        if name != "progress"  # bars are silent by themselves where there is no terminal
+    ]
+    for name, (kind, default, _) in added.items():
+        parameters.append(
+            inspect.Parameter(
+                name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind
+            )
+        )
+    command.__dict__["__signature__"] = inspect.Signature(parameters)
+    command.__annotations__ = {p.name: p.annotation for p in parameters}
+    head, _, rest = (inspect.getdoc(function) or "").partition("Args:\n")
+    texts = [rest.partition("\n\n")[0]]
+    texts += [f"    {name}: {text}" for name, (_, _, text) in added.items()]
+    command.__doc__ = f"{head}Args:\n" + "\n".join(texts)
+    return command
+
+
+def _shell_parameter(
+    parameter: inspect.Parameter, shell_types: dict[str, Any]
+) -> inspect.Parameter:
+    kind = shell_types.get(parameter.name, parameter.annotation)
+    default = str(parameter.default) if parameter.name == "probes" else parameter.default
+    if get_origin(kind) in (Union, UnionType) and NoneType in get_args(kind):
+        # tyro would show "{None}|INT"; leaving the argument out is how a shell says None.
+        (inner,) = (one for one in get_args(kind) if one is not NoneType)
+        metavar = "INT [INT ...]" if get_origin(inner) is tuple else inner.__name__.upper()
+        kind = Annotated[kind, tyro.conf.arg(metavar=metavar)]
+    return parameter.replace(annotation=kind, default=default, kind=inspect.Parameter.KEYWORD_ONLY)
+
+
+COMMANDS: dict[str, Callable[..., None]] = {
+    "inspect": inspect_expert,
+    "distill": as_command(
+        distill,
+        _distill,
+        {"expert": ExpertPath, "env": EnvironmentId, "probes": str, "trainer": str},
+        {
+            "out": (Path, Path("runs/latest"), "Folder that the run is saved in."),
+            "compare": (bool, False, "Also clone plainly, without probes, and show both."),
+        },
+    ),
+    "evaluate": as_command(
+        evaluate, _evaluate, {"policy": PolicyPath, "env": EnvironmentId, "expert": str}, {}
+    ),
+}
+
+
+def main() -> None:
+    """Run the command line; exit code 0 done, 1 failed, 2 wrong use."""
+    try:
+        tyro.extras.subcommand_cli_from_dict(
+            COMMANDS, prog="fdtasil", description="Distil a black-box controller.", config=()
+        )
+    except FdtasilError as error:
+        print(f"fdtasil: {error}", file=sys.stderr)
+        sys.exit(2 if isinstance(error, SettingError) else 1)
+    except KeyboardInterrupt:
+        print("fdtasil: interrupted", file=sys.stderr)
+        sys.exit(130)

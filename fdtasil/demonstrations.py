@@ -1,0 +1,289 @@
+"""States, expert actions and probe answers: made, pooled, kept on disk."""
+
+import io
+import zipfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+
+from fdtasil.errors import ExpertError, SettingError, StorageError
+from fdtasil.experts import Expert
+from fdtasil.probes import Probes
+from fdtasil.rollouts import Episodes
+
+__all__ = [
+    "Answers",
+    "Demonstrations",
+    "Statistics",
+    "ask_probes",
+    "label",
+    "probed_dimension",
+    "statistics",
+]
+
+# A coordinate whose deviation is below this share of the median one does not move: what is left
+# is rounding (Humanoid has one of 1.8e-14), and dividing by it would blow up the first bump.
+_STILL = 1e-4
+# The normaliser divides by no less than this share of the median deviation.
+_FLOOR = 1e-2
+_ROUNDING = 64 * float(np.finfo(np.float32).eps)
+
+
+@dataclass(frozen=True)
+class Demonstrations:
+    """Labelled states.
+
+    Attributes:
+        observations: (N, n) float32 raw observations.
+        actions: (N, m) float32, always the expert's answer, never clipped.
+        episode: (N,) int32, the episode that the state was visited in.
+        round: (N,) int32, the round that the state was collected in.
+    """
+
+    observations: np.ndarray
+    actions: np.ndarray
+    episode: np.ndarray
+    round: np.ndarray
+
+    def __len__(self) -> int:
+        return len(self.observations)
+
+    def __add__(self, other: "Demonstrations") -> "Demonstrations":
+        return Demonstrations(
+            np.concatenate([self.observations, other.observations]),
+            np.concatenate([self.actions, other.actions]),
+            np.concatenate([self.episode, other.episode]),
+            np.concatenate([self.round, other.round]),
+        )
+
+
+@dataclass(frozen=True)
+class Statistics:
+    """Scales of the observations, taken once and frozen.
+
+    Attributes:
+        mean: (n,) of the states.
+        scale: (n,) what the student's normaliser divides by; 1 for coordinates that do not move.
+        deviation: (n,) standard deviation of the states.
+        live: (n,) bool, whether the coordinate moves, and is probed in whitened space.
+    """
+
+    mean: np.ndarray
+    scale: np.ndarray
+    deviation: np.ndarray
+    live: np.ndarray
+
+
+@dataclass(frozen=True)
+class Answers:
+    """What the expert said around each state.
+
+    Attributes:
+        displacements: (P, n) float32 bank of displacements in raw observation units; for an
+            exact stencil the directions that were differentiated along.
+        numbers: (N, k) int32, the rows of the bank that each state was probed along.
+        values: (N, k, p, m) float32 expert actions at state + offset * displacement for each of
+            the stencil's p offsets; for an exact stencil p is 1 and they are derivatives.
+        gain: What turns a difference of values into the whitened Jacobian's Frobenius norm,
+            in expectation over directions: sqrt(d) / step.
+    """
+
+    displacements: np.ndarray
+    numbers: np.ndarray
+    values: np.ndarray
+    gain: float
+
+    def __add__(self, other: "Answers") -> "Answers":
+        return Answers(
+            np.concatenate([self.displacements, other.displacements]),
+            np.concatenate([self.numbers, other.numbers + len(self.displacements)]),
+            np.concatenate([self.values, other.values]),
+            self.gain,
+        )
+
+
+def label(episodes: Episodes, expert: Expert, first_episode: int, round_: int) -> Demonstrations:
+    """Label the visited states with the expert's actions.
+
+    The expert is asked only where the behaviour did not ask it already.
+
+    Args:
+        episodes: What was recorded.
+        expert: Who labels.
+        first_episode: Number of the first of these episodes in the run.
+        round_: Number of the round.
+
+    Raises:
+        SettingError: If no state was visited.
+    """
+    valid = episodes.valid
+    observations = episodes.observations[valid]
+    if not len(observations):
+        raise SettingError("no state was recorded", "at least one episode", "raise episodes=")
+    known = episodes.expert_actions
+    actions = known[valid] if known is not None else expert.ask(observations, "label")
+    numbers = np.arange(first_episode, first_episode + len(valid), dtype=np.int32)
+    episode = np.broadcast_to(numbers[:, None], valid.shape)[valid]
+    return Demonstrations(observations, actions, episode, np.full(len(episode), round_, np.int32))
+
+
+def statistics(observations: np.ndarray) -> Statistics:
+    """Measure the scale of each coordinate.
+
+    Args:
+        observations: (N, n) raw observations.
+    """
+    wide = observations.astype(np.float64)
+    mean, deviation = wide.mean(axis=0), wide.std(axis=0)
+    moving = deviation > _ROUNDING * np.abs(wide).max(axis=0)
+    median = float(np.median(deviation[moving])) if moving.any() else 1.0
+    live = moving & (deviation > _STILL * median)
+    scale = np.where(live, np.maximum(deviation, _FLOOR * median), 1.0)
+    return Statistics(mean, scale, deviation, live)
+
+
+def probed_dimension(probes: Probes, scales: Statistics) -> int:
+    """Return d, the number of coordinates that are probed."""
+    return len(scales.live) if probes.space == "raw" else int(scales.live.sum())
+
+
+def ask_probes(
+    expert: Expert,
+    observations: np.ndarray,
+    probes: Probes,
+    scales: Statistics,
+    random: np.random.Generator,
+) -> Answers:
+    """Ask the expert around each state.
+
+    Args:
+        expert: Who is asked; differentiated instead, if the stencil is exact.
+        observations: (N, n) float32 states.
+        probes: The derivative source, with radius and space set.
+        scales: Of the demonstrations.
+        random: Draws the directions.
+
+    Raises:
+        ExpertError: If the stencil is exact and the expert can't be differentiated.
+        SettingError: If no coordinate moves, or a step is lost in rounding.
+    """
+    step_scale = np.ones(len(scales.live))
+    if probes.space != "raw":
+        step_scale = np.where(scales.live, scales.deviation, 0.0)
+    live = np.flatnonzero(step_scale)
+    if not len(live):
+        raise SettingError(
+            "no coordinate of the observations moves",
+            "states that differ",
+            "record longer or more episodes, or pass probes=0",
+        )
+    assert probes.radius is not None, "the pipeline sets the radius"
+    reach = 1.0 if probes.space == "raw" else probes.directions.reach(len(live))
+    step = 1.0 if probes.stencil.exact else probes.radius * reach
+    bank, numbers = probes.directions.draw(len(observations), len(live), random)
+    displacements = np.zeros((len(bank), len(step_scale)), np.float32)
+    displacements[:, live] = step * bank * step_scale[live]
+    gain = len(live) ** 0.5 / step
+    ask = _differentiate if probes.stencil.exact else _ask_values
+    values = ask(expert, observations, displacements, numbers, probes.stencil.offsets)
+    return Answers(displacements, numbers, values, gain)
+
+
+def _ask_values(
+    expert: Expert,
+    observations: np.ndarray,
+    displacements: np.ndarray,
+    numbers: np.ndarray,
+    offsets: Sequence[float],
+) -> np.ndarray:
+    """Ask for the values at the stencil's points, a bounded number of rows at a time."""
+    states, count = numbers.shape
+    block = max(1, 65536 // (count * len(offsets)))
+    shifts = np.asarray(offsets, np.float32)[:, None]
+    parts = []
+    for start in range(0, states, block):
+        rows = slice(start, start + block)
+        moved = displacements[numbers[rows]][:, :, None, :] * shifts
+        points = observations[rows, None, None, :] + moved
+        _check_moved(points, observations[rows], displacements)
+        answers = expert.ask(points.reshape(-1, points.shape[-1]), "probe")
+        parts.append(answers.reshape(*points.shape[:3], -1))
+    return np.concatenate(parts)
+
+
+def _check_moved(points: np.ndarray, centres: np.ndarray, displacements: np.ndarray) -> None:
+    still = (points == centres[:, None, None, :]).all(axis=-1)
+    if still.any() and displacements.any(axis=1).all():
+        raise SettingError(
+            f"{still.sum()} of {still.size} probes do not move the state: float32 rounds the "
+            "step away",
+            "a radius above the rounding of the observations",
+            "raise the radius, or probe in whitened space",
+        )
+
+
+def _differentiate(
+    expert: Expert,
+    observations: np.ndarray,
+    directions: np.ndarray,
+    numbers: np.ndarray,
+    offsets: Sequence[float],
+) -> np.ndarray:
+    """Return the exact directional derivatives, (N, k, 1, m)."""
+    module = expert.module
+    if module is None:
+        raise ExpertError(
+            f"{expert.name} can't be differentiated",
+            "a torch module, or an ONNX file made of the operators of an MLP",
+            'probe it instead: probes="basis" or probes=10',
+        )
+    place = next(module.parameters(), torch.zeros(()))
+    jacobian = torch.func.vmap(torch.func.jacrev(lambda x: module(x[None])[0]))
+    parts = []
+    for start in range(0, len(observations), 256):
+        rows = slice(start, start + 256)
+        states = torch.from_numpy(observations[rows]).to(place.device, place.dtype)
+        with torch.no_grad():
+            full = jacobian(states).float().cpu()
+        along = torch.from_numpy(directions[numbers[rows]])
+        parts.append(torch.einsum("bmn,bkn->bkm", full, along).numpy())
+    return np.concatenate(parts)[:, :, None, :]
+
+
+def to_npz(demonstrations: Demonstrations, answers: Answers | None) -> bytes:
+    """Return demonstrations and answers as an npz file.
+
+    Schema: `observations`, `actions`, `episode`, `round` as in `Demonstrations`; with probes also
+    `displacements`, `numbers`, `values`, `gain` as in `Answers`.
+    """
+    arrays = dict(vars(demonstrations)) | (dict(vars(answers)) if answers else {})
+    target = io.BytesIO()
+    np.savez(target, **arrays)
+    return target.getvalue()
+
+
+def from_npz(data: bytes) -> tuple[Demonstrations, Answers | None]:
+    """Read what `to_npz` wrote.
+
+    Raises:
+        StorageError: If it is not such a file.
+    """
+    try:
+        with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
+            demonstrations = Demonstrations(
+                arrays["observations"], arrays["actions"], arrays["episode"], arrays["round"]
+            )
+            if "values" not in arrays:
+                return demonstrations, None
+            bank, numbers, values = (
+                arrays[name] for name in ("displacements", "numbers", "values")
+            )
+            return demonstrations, Answers(bank, numbers, values, float(arrays["gain"]))
+    except (KeyError, ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
+        raise StorageError(
+            f"not demonstrations: {error}",
+            "a demonstrations.npz written by fdtasil",
+            "check the path, or save again",
+        ) from error

@@ -1,0 +1,162 @@
+"""The result of a distillation, and its run folder."""
+
+import csv
+import io
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fdtasil.demonstrations import Answers, Demonstrations, from_npz, to_npz
+from fdtasil.errors import StorageError
+from fdtasil.evaluation import Evaluation
+from fdtasil.figures import draw_returns, draw_training
+from fdtasil.onnx_files import export_module
+from fdtasil.storage import to_json, verify, write_bytes, write_folder
+from fdtasil.student import Student
+
+__all__ = ["Distilled"]
+
+_PARITY_STATES = 1000
+
+
+@dataclass(frozen=True)
+class Distilled:
+    """A student, and how it came to be.
+
+    Attributes:
+        student: The policy, on the CPU.
+        evaluation: Student against expert, from the same starts.
+        history: Training losses, one entry for each 100 steps: round, step, loss, action_error,
+            derivative_error.
+        queries: Rows that the expert answered, by purpose: act, label, probe, check (the gate),
+            evaluate.
+        settings: The exact arguments and what they resolved to, with versions; plain JSON.
+        report: What `report.json` holds.
+        demonstrations: The labelled states.
+        answers: The expert's answers to the probes, or None.
+
+    Example:
+        >>> import fdtasil
+        >>> result = fdtasil.distill(
+        ...     lambda x: -x[:, 1:2] - x[:, 2:3], "Pendulum-v1", probes=2,
+        ...     episodes=1, horizon=20, steps=20, hidden=(8,), evaluation_episodes=2,
+        ... )
+        >>> result.queries["probe"]
+        40
+    """
+
+    student: Student
+    evaluation: Evaluation
+    history: list[dict[str, float]]
+    queries: dict[str, int]
+    settings: dict[str, Any]
+    report: dict[str, Any]
+    demonstrations: Demonstrations
+    answers: Answers | None
+
+    def onnx_bytes(self) -> bytes:
+        """Return the student as one ONNX file, compared with torch on its own training states.
+
+        Raises:
+            ExportError: If the two differ by more than 1e-5.
+        """
+        states = self.demonstrations.observations
+        chosen = np.linspace(0, len(states) - 1, min(len(states), _PARITY_STATES)).astype(int)
+        return export_module(self.student, states[chosen], self._metadata())
+
+    def to_onnx(self, path: str | Path) -> Path:
+        """Write the student as one ONNX file: input `obs` (batch, n), output `actions`.
+
+        Normaliser and action bounds are inside; `metadata_props` says the rest.
+
+        Raises:
+            ExportError: If the file's answers differ from torch's by more than 1e-5.
+            StorageError: If it can't be written.
+        """
+        write_bytes(Path(path), self.onnx_bytes())
+        return Path(path)
+
+    def save(self, folder: str | Path) -> Path:
+        """Write the run folder.
+
+        Files: config.json, report.json, progress.csv, demonstrations.npz, student.safetensors,
+        student.onnx, figures/training.png, figures/returns.png, and last a manifest.
+
+        Raises:
+            StorageError: If a file can't be written; finished files stay whole.
+        """
+        files = {
+            "config.json": to_json(self.settings),
+            "progress.csv": _csv(self.history),
+            "demonstrations.npz": to_npz(self.demonstrations, self.answers),
+            "student.safetensors": self.student.to_bytes(self._metadata()),
+            "student.onnx": self.onnx_bytes(),
+            "figures/training.png": draw_training(self.history),
+            "figures/returns.png": draw_returns(self.evaluation),
+            "report.json": to_json(self.report),
+        }
+        write_folder(Path(folder), files)
+        return Path(folder)
+
+    @classmethod
+    def load(cls, folder: str | Path) -> "Distilled":
+        """Read a run folder; nothing in it is run or unpickled.
+
+        Raises:
+            StorageError: If a file is missing, changed since, or not one of ours.
+        """
+        files = verify(Path(folder))
+        try:
+            report = json.loads(files["report.json"])
+            demonstrations, answers = from_npz(files["demonstrations.npz"])
+            return cls(
+                student=Student.from_bytes(files["student.safetensors"]),
+                evaluation=Evaluation.from_json(report["evaluation"]),
+                history=_read_csv(files["progress.csv"]),
+                queries=report["queries"],
+                settings=json.loads(files["config.json"]),
+                report=report,
+                demonstrations=demonstrations,
+                answers=answers,
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise StorageError(
+                f"{folder} can't be read: {type(error).__name__} {error}",
+                "a run folder written by this version of fdtasil",
+                "check the path, or run distill again",
+            ) from error
+
+    def _metadata(self) -> Mapping[str, str]:
+        expert = self.report["expert"]
+        low, high = self.student.low.tolist(), self.student.high.tolist()
+        return {
+            "fdtasil.version": self.report["versions"]["fdtasil"],
+            "fdtasil.environment": self.report["env"],
+            "fdtasil.observation_size": str(self.student.shape.observation_size),
+            "fdtasil.action_low": ",".join(f"{value:g}" for value in low),
+            "fdtasil.action_high": ",".join(f"{value:g}" for value in high),
+            "fdtasil.expert_sha256": expert["sha256"] or "",
+            "fdtasil.expert_return": f"{self.evaluation.expert_return:.6g}",
+            "fdtasil.student_return": f"{self.evaluation.student_return:.6g}",
+            "fdtasil.normalized_return": f"{self.evaluation.normalized_return:.6g}",
+        }
+
+
+def _csv(history: list[dict[str, float]]) -> bytes:
+    target = io.StringIO()
+    writer = csv.DictWriter(target, list(history[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(history)
+    return target.getvalue().encode()
+
+
+def _read_csv(data: bytes) -> list[dict[str, float]]:
+    integers = {"round", "step"}
+    return [
+        {name: int(value) if name in integers else float(value) for name, value in row.items()}
+        for row in csv.DictReader(io.StringIO(data.decode()))
+    ]

@@ -1,0 +1,186 @@
+"""What an environment argument means: an id, an instance or a factory, and its two boxes."""
+
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from types import TracebackType
+
+import gymnasium
+import numpy as np
+
+from fdtasil.errors import EnvironmentFault, FdtasilWarning, SettingError
+
+__all__ = ["EnvironmentLike", "EnvironmentPool", "resolve_horizon"]
+
+EnvironmentLike = str | gymnasium.Env | Callable[[], gymnasium.Env]
+
+
+@dataclass(frozen=True)
+class Boxes:
+    """The continuous spaces of an environment.
+
+    Attributes:
+        observation_size: n, the length of an observation.
+        low: (m,) float32, lower action bounds in environment units; -inf where there is none.
+        high: (m,) float32, upper action bounds.
+    """
+
+    observation_size: int
+    low: np.ndarray
+    high: np.ndarray
+
+    @property
+    def action_size(self) -> int:
+        """m, the length of an action."""
+        return len(self.low)
+
+
+class EnvironmentPool:
+    """Equal copies of one environment, made when they are needed and kept for the next rollout.
+
+    Args:
+        environment: A gymnasium id (`module:Id` imports the module first), a gymnasium
+            environment, or a function without arguments that makes one. An environment that is
+            passed in is used as it is, one episode at a time, and is not closed.
+
+    Raises:
+        EnvironmentFault: If it can't be made, or its spaces are not flat continuous boxes.
+
+    Example:
+        >>> with EnvironmentPool("Pendulum-v1") as pool:
+        ...     pool.boxes.observation_size, pool.boxes.action_size
+        (3, 1)
+    """
+
+    def __init__(self, environment: EnvironmentLike) -> None:
+        self._owned = not isinstance(environment, gymnasium.Env)
+        self._make = _factory(environment)
+        first = self._new()
+        self._members = [first]
+        self.name = first.spec.id if first.spec else type(first.unwrapped).__name__
+        self.time_limit = first.spec.max_episode_steps if first.spec else None
+        self.boxes = _read_boxes(first, self.name)
+
+    def take(self, count: int) -> list[gymnasium.Env]:
+        """Return up to `count` copies; fewer where only one exists."""
+        while self._owned and len(self._members) < count:
+            self._members.append(self._new())
+        return self._members[:count]
+
+    def close(self) -> None:
+        """Close the copies that the pool made."""
+        for member in self._members if self._owned else []:
+            member.close()
+
+    def __enter__(self) -> "EnvironmentPool":
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self.close()
+
+    def _new(self) -> gymnasium.Env:
+        try:
+            with _model_warnings_kept():
+                made = self._make()
+        except Exception as error:  # a factory is the caller's code and may raise anything
+            first_line = (str(error).splitlines() or [type(error).__name__])[0]
+            raise EnvironmentFault(
+                f"the environment can't be made: {first_line}",
+                "a gymnasium id, an environment, or a function that makes one",
+                "try gymnasium.make(...) on its own; ids of other packages are 'module:Id'",
+            ) from error
+        if not isinstance(made, gymnasium.Env):
+            raise EnvironmentFault(
+                f"the environment factory returned {type(made).__name__}",
+                "a gymnasium.Env (one, not a vector environment)",
+                "return gymnasium.make(...) from it",
+            )
+        return made
+
+
+def resolve_horizon(horizon: int | None, pool: EnvironmentPool) -> int:
+    """Return the number of steps after which an episode is cut.
+
+    Raises:
+        SettingError: If it is not a positive integer, or neither the caller nor the environment
+            sets one.
+    """
+    if horizon is None:
+        horizon = pool.time_limit
+    if isinstance(horizon, bool) or not isinstance(horizon, int) or horizon < 1:
+        raise SettingError(
+            f"horizon={horizon!r} for {pool.name}",
+            "a positive number of steps, or an environment with a time limit of its own",
+            "write for example horizon=300",
+        )
+    return horizon
+
+
+@contextmanager
+def _model_warnings_kept() -> Iterator[None]:
+    """Pass MuJoCo's warnings about a model on to Python, where equal ones are shown once.
+
+    It would print each for every copy of the environment; those of a deprecated attribute in
+    gymnasium's own model files tell a user nothing.
+    """
+    import mujoco
+
+    # getattr: the type stubs do not know these two functions.
+    get, put = (getattr(mujoco, f"{verb}_mju_user_warning") for verb in ("get", "set"))
+    before = get()
+    put(_pass_on)
+    try:
+        yield
+    finally:
+        put(before)
+
+
+def _pass_on(message: str) -> None:
+    if "deprecated" not in message:
+        warnings.warn(f"MuJoCo: {message}", FdtasilWarning, stacklevel=2)
+
+
+def _factory(environment: EnvironmentLike) -> Callable[[], gymnasium.Env]:
+    if isinstance(environment, gymnasium.Env):
+        return lambda: environment
+    if isinstance(environment, str):
+        return lambda: gymnasium.make(environment)
+    if callable(environment):
+        return environment
+    raise EnvironmentFault(
+        f"env is a {type(environment).__name__}",
+        "a gymnasium id, an environment, or a function that makes one",
+        'write for example env="HalfCheetah-v5"',
+    )
+
+
+def _read_boxes(environment: gymnasium.Env, name: str) -> Boxes:
+    observation = _flat_box(environment.observation_space, name, "observations")
+    action = _flat_box(environment.action_space, name, "actions")
+    low, high = action.low.astype(np.float32), action.high.astype(np.float32)
+    if not (low < high).all():
+        raise EnvironmentFault(
+            f"{name}: action bounds {low} to {high}",
+            "lower bounds below upper bounds",
+            "drop the fixed actions with a gymnasium.ActionWrapper",
+        )
+    return Boxes(int(observation.shape[0]), low, high)
+
+
+def _flat_box(space: gymnasium.Space, name: str, role: str) -> gymnasium.spaces.Box:
+    if isinstance(space, gymnasium.spaces.Box) and len(space.shape) == 1:
+        if np.issubdtype(space.dtype, np.floating):
+            return space
+    advice = {
+        "observations": "wrap the environment in gymnasium.wrappers.FlattenObservation",
+        "actions": "fdtasil distils continuous controllers; choose or wrap the environment so",
+    }
+    raise EnvironmentFault(
+        f"{name} has {role} {space}", "a Box of floats with one dimension", advice[role]
+    )

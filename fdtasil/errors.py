@@ -1,0 +1,67 @@
+"""The library's errors: what was found, what was expected, and the next step."""
+
+__all__ = [
+    "EnvironmentFault",
+    "ExpertError",
+    "ExportError",
+    "FdtasilError",
+    "FdtasilWarning",
+    "FitError",
+    "SettingError",
+    "StorageError",
+]
+
+
+class FdtasilError(Exception):
+    """A failure that the caller can act on.
+
+    Args:
+        found: What was found, naming the argument or the file.
+        expected: What would have been right.
+        next_step: What to do now.
+
+    Example:
+        >>> print(FdtasilError("probes=-1", "an integer of at least 0", "write probes=10"))
+        probes=-1
+          expected: an integer of at least 0
+          next step: write probes=10
+    """
+
+    def __init__(self, found: str, expected: str, next_step: str) -> None:
+        # All three go to Exception.args, so that the error survives pickling between processes.
+        super().__init__(found, expected, next_step)
+        self.found, self.expected, self.next_step = found, expected, next_step
+
+    def __str__(self) -> str:
+        return f"{self.found}\n  expected: {self.expected}\n  next step: {self.next_step}"
+
+
+class SettingError(FdtasilError, ValueError):
+    """An argument has a value that can't be used."""
+
+
+class EnvironmentFault(FdtasilError):
+    """An environment can't be used, or misbehaved while it was stepped."""
+
+
+class ExpertError(FdtasilError):
+    """An expert can't be opened, or failed a check."""
+
+
+class FitError(FdtasilError):
+    """The optimisation of the student went wrong."""
+
+
+class ExportError(FdtasilError):
+    """A student or an agent can't be written as ONNX, or the file disagrees with its source."""
+
+
+class StorageError(FdtasilError, OSError):
+    """A file can't be read or written."""
+
+    def __str__(self) -> str:  # OSError formats its first two arguments as an errno pair
+        return FdtasilError.__str__(self)
+
+
+class FdtasilWarning(UserWarning):
+    """Something that did not stop the work, and that the result should be read with."""

@@ -1,0 +1,180 @@
+"""Paired evaluation: student and expert from the same starts, with an interval."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy import stats
+
+from fdtasil.environments import EnvironmentPool
+from fdtasil.experts import Expert
+from fdtasil.rollouts import Behaviour, Decision, Episodes, Policy, follow, rollout
+from fdtasil.seeding import generator
+
+__all__ = ["Evaluation", "compare", "random_behaviour"]
+
+_RESAMPLES = 2000
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """How a student did beside its expert, from the same starts.
+
+    Attributes:
+        episodes: E, number of paired episodes.
+        horizon: T, steps after which an episode was cut.
+        expert_return: Mean undiscounted return of the expert.
+        student_return: Mean undiscounted return of the student.
+        reference_return: What counts as zero: 0 where the expert's returns are positive, else
+            the mean return of uniformly random actions.
+        normalized_return: (student - reference) / (expert - reference); 1 is the expert.
+        ci95: 95 % bootstrap interval of the normalised return, over paired episodes.
+        survival: Share of the student's episodes that the environment did not end.
+        expert_survival: The same for the expert.
+        action_error: Mean Euclidean distance of the student's action to the expert's, on the
+            student's own states, in action units.
+        imitation_gap: Largest distance between the two trajectories of a pair while both last,
+            in the expert's standard deviations (root mean square over coordinates), averaged over
+            pairs (TaSIL, section 2). Chaotic systems drift apart whatever the student does.
+        expert_returns: (E,) return of each episode.
+        student_returns: (E,) return of each episode, in the same order.
+    """
+
+    episodes: int
+    horizon: int
+    expert_return: float
+    student_return: float
+    reference_return: float
+    normalized_return: float
+    ci95: tuple[float, float]
+    survival: float
+    expert_survival: float
+    action_error: float
+    imitation_gap: float
+    expert_returns: tuple[float, ...]
+    student_returns: tuple[float, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the evaluation as plain JSON values."""
+        return {
+            name: list(value) if isinstance(value, tuple) else value
+            for name, value in vars(self).items()
+        }
+
+    @classmethod
+    def from_json(cls, fields: Mapping[str, Any]) -> "Evaluation":
+        """Read what `to_json` returned."""
+        lists = {name: tuple(value) for name, value in fields.items() if isinstance(value, list)}
+        return cls(**{**fields, **lists})
+
+    def __str__(self) -> str:
+        low, high = self.ci95
+        expert = f"{self.expert_return:10.1f}   survival {self.expert_survival:.2f}"
+        student = f"{self.student_return:10.1f}   survival {self.survival:.2f}"
+        share = f"{self.normalized_return:10.3f}   95 % [{low:.3f}, {high:.3f}]"
+        return (
+            f"{self.episodes} paired episodes of {self.horizon} steps\n"
+            f"  expert            {expert}\n"
+            f"  student           {student}\n"
+            f"  normalised return {share}\n"
+            f"  action error      {self.action_error:10.3f}   on the student's own states"
+        )
+
+
+def compare(
+    student: Policy,
+    expert: Expert,
+    expert_episodes: Episodes,
+    pool: EnvironmentPool,
+    horizon: int,
+    seed: int,
+    on_step: Callable[[int], None] = lambda count: None,
+) -> Evaluation:
+    """Run a policy from the starts of the expert's episodes, and compare.
+
+    Args:
+        student: Any policy.
+        expert: Answers on the student's states, counted under "evaluate".
+        expert_episodes: (E, T) the expert's own, already recorded.
+        pool: The environment.
+        horizon: T.
+        seed: Of the bootstrap, and of the random actions where they are the reference.
+        on_step: Told of environment steps.
+    """
+    seeds = [int(s) for s in expert_episodes.seeds]
+    student_episodes = rollout(follow(student), pool, seeds, horizon, on_step=on_step)
+    reference = _reference_return(expert_episodes, pool, seeds, horizon, seed)
+    ours, theirs = student_episodes.returns, expert_episodes.returns
+    visited = student_episodes.observations[student_episodes.valid]
+    own = student_episodes.actions[student_episodes.valid]
+    distance = np.linalg.norm(own - expert.ask(visited, "evaluate"), axis=1)
+    return Evaluation(
+        episodes=len(seeds),
+        horizon=horizon,
+        expert_return=float(theirs.mean()),
+        student_return=float(ours.mean()),
+        reference_return=reference,
+        normalized_return=float((ours.mean() - reference) / (theirs.mean() - reference)),
+        ci95=_interval(ours - reference, theirs - reference, seed),
+        survival=float(1 - student_episodes.terminated.mean()),
+        expert_survival=float(1 - expert_episodes.terminated.mean()),
+        action_error=float(distance.mean()),
+        imitation_gap=_imitation_gap(student_episodes, expert_episodes),
+        expert_returns=tuple(theirs.tolist()),
+        student_returns=tuple(ours.tolist()),
+    )
+
+
+def random_behaviour(pool: EnvironmentPool) -> Behaviour:
+    """Return the behaviour of uniformly random actions; unbounded ones are standard normal."""
+    low, high = pool.boxes.low, pool.boxes.high
+    bounded = np.isfinite(low) & np.isfinite(high)
+
+    def act(observations: np.ndarray, noise: Sequence[np.random.Generator]) -> Decision:
+        rows = []
+        for random in noise:
+            uniform = random.uniform(np.where(bounded, low, 0), np.where(bounded, high, 1))
+            rows.append(np.where(bounded, uniform, random.standard_normal(len(low))))
+        return Decision(np.asarray(rows, np.float32), None)
+
+    return act
+
+
+def _reference_return(
+    expert: Episodes, pool: EnvironmentPool, seeds: list[int], horizon: int, seed: int
+) -> float:
+    if (expert.returns > 0).all():
+        return 0.0
+    noise = [generator(seed, "random actions", episode) for episode in range(len(seeds))]
+    return float(rollout(random_behaviour(pool), pool, seeds, horizon, noise).returns.mean())
+
+
+def _interval(ours: np.ndarray, theirs: np.ndarray, seed: int) -> tuple[float, float]:
+    def ratio(a: np.ndarray, b: np.ndarray, axis: int = -1) -> np.ndarray:
+        return a.mean(axis=axis) / b.mean(axis=axis)
+
+    if len(ours) < 2 or np.ptp(ours / theirs) == 0:
+        point = float(ratio(ours, theirs))
+        return point, point
+    result = stats.bootstrap(
+        (ours, theirs),
+        ratio,
+        paired=True,
+        vectorized=True,
+        method="percentile",
+        n_resamples=_RESAMPLES,
+        rng=generator(seed, "bootstrap"),
+    )
+    return float(result.confidence_interval.low), float(result.confidence_interval.high)
+
+
+def _imitation_gap(student: Episodes, expert: Episodes) -> float:
+    both = student.valid & expert.valid
+    deviation = expert.observations[expert.valid].std(axis=0)
+    live = deviation > 1e-6
+    if not live.any():
+        return 0.0
+    apart = (student.observations - expert.observations)[..., live] / deviation[live]
+    distance = np.sqrt((apart**2).mean(axis=-1))
+    return float(np.where(both, distance, 0.0).max(axis=1).mean())

@@ -1,0 +1,106 @@
+"""The one type that every kind of expert is turned into: a counted, checked black box."""
+
+from collections import Counter
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import Literal
+
+import numpy as np
+import torch
+
+from fdtasil.errors import ExpertError
+
+__all__ = ["Expert", "Purpose"]
+
+Purpose = Literal["check", "act", "label", "probe", "evaluate"]
+"""Why a row was asked: gate, acting in rollouts, labels, probes, evaluation."""
+
+_CHUNK = 1024  # rows asked at once; a fixed size keeps onnxruntime's memory from growing
+
+
+@dataclass(frozen=True)
+class Expert:
+    """A black box that answers observations with actions.
+
+    Attributes:
+        answer: (B, n) float32 raw observations -> (B, m) actions in environment units.
+        name: What to call it in messages and reports.
+        observation_size: n, or None where the expert does not say.
+        action_size: m, or None where the expert does not say.
+        sha256: Of the file it came from, or None.
+        module: The same function as a differentiable torch module, or None; only the analytic
+            reference (`probes="jacobian"`) uses it.
+        chunk: Rows asked at once.
+        queries: Rows answered so far, by purpose.
+
+    Example:
+        >>> import numpy as np
+        >>> expert = Expert(lambda x: 2 * x[:, :1], "twice the first coordinate")
+        >>> expert.ask(np.ones((3, 4), np.float32), "probe").ravel(), dict(expert.queries)
+        (array([2., 2., 2.], dtype=float32), {'probe': 3})
+    """
+
+    answer: Callable[[np.ndarray], np.ndarray]
+    name: str
+    observation_size: int | None = None
+    action_size: int | None = None
+    sha256: str | None = None
+    module: torch.nn.Module | None = None
+    chunk: int = _CHUNK
+    queries: Counter[str] = field(default_factory=Counter)
+
+    def ask(self, observations: np.ndarray, purpose: Purpose) -> np.ndarray:
+        """Answer a batch and count its rows.
+
+        Args:
+            observations: (B, n) float32 raw observations; not changed.
+            purpose: The entry of the ledger that the rows are counted under.
+
+        Returns:
+            (B, m) float32 actions, in an array of their own.
+
+        Raises:
+            ExpertError: If the expert raises, or its answer has another shape or is not finite.
+        """
+        rows = np.ascontiguousarray(observations, np.float32)
+        self.queries[purpose] += len(rows)
+        starts = range(0, max(len(rows), 1), self.chunk)
+        # Each call gets a copy and its answer is copied: experts that write into their input
+        # or return their own buffer would otherwise change what is stored.
+        parts = [self._ask_chunk(rows[start : start + self.chunk].copy()) for start in starts]
+        return np.concatenate(parts)
+
+    def policy(self, purpose: Purpose) -> Callable[[np.ndarray], np.ndarray]:
+        """Return the expert as a policy whose rows are counted under `purpose`."""
+        return lambda observations: self.ask(observations, purpose)
+
+    def _ask_chunk(self, rows: np.ndarray) -> np.ndarray:
+        expected = f"({len(rows)}, {self.action_size or 'm'}) finite numbers"
+        try:
+            answer = np.array(self.answer(rows), dtype=np.float32, order="C")
+        except ExpertError:
+            raise
+        except Exception as error:
+            raise ExpertError(
+                f"{self.name} raised {type(error).__name__} on {len(rows)} observations: {error}",
+                expected,
+                "call it on such a batch on its own; experts answer (B, n) with (B, m)",
+            ) from error
+        if answer.ndim != 2 or len(answer) != len(rows) or not self._has_action_size(answer):
+            raise ExpertError(
+                f"{self.name} answered {rows.shape} observations with shape {answer.shape}",
+                expected,
+                "return one row of actions for each row of observations",
+            )
+        bad = ~np.isfinite(answer).all(axis=1)
+        if bad.any():
+            raise ExpertError(
+                f"{self.name} is not finite on {bad.sum()} of {len(rows)} observations, "
+                f"the first of them row {int(bad.argmax())}",
+                expected,
+                "check its weights, and its answer to the observations that it is given",
+            )
+        return answer
+
+    def _has_action_size(self, answer: np.ndarray) -> bool:
+        return self.action_size is None or answer.shape[1] == self.action_size

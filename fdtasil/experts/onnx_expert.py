@@ -1,0 +1,170 @@
+"""ONNX files as experts, with the names, types and batch sizes that users' files have."""
+
+import time
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from fdtasil.errors import ExpertError, FdtasilWarning
+from fdtasil.experts.expert import Expert
+from fdtasil.experts.twin import torch_twin
+from fdtasil.onnx_files import is_batched, open_session, read_model, rebatched, run_session
+
+if TYPE_CHECKING:
+    import onnx
+    import onnxruntime
+
+    Session = onnxruntime.InferenceSession
+
+__all__ = ["open_onnx"]
+
+Answer = Callable[[np.ndarray], np.ndarray]
+
+
+def open_onnx(
+    path: Path, observation_size: int | None, action_size: int | None, output: str | None
+) -> Expert:
+    """Open an ONNX file as an expert.
+
+    Args:
+        path: The file; weights may lie in a side file beside it.
+        observation_size: n, or None to believe the file.
+        action_size: m, or None to believe the file.
+        output: Name of the output that holds the actions, where several could.
+
+    Returns:
+        The expert. Its `module` is a torch twin where the graph is an MLP, else None.
+
+    Raises:
+        ExpertError: If the file can't be opened, or its signature does not fit.
+    """
+    model, digest = read_model(path)
+    session = open_session(model, str(path))
+    n = _observation_size(session, path, observation_size)
+    chosen = _choose_output(session, path, action_size, output)
+    answer = _answer(model, session, chosen, n)
+    m = answer(np.zeros((2, n), np.float32)).shape[-1]
+    twin = torch_twin(model, chosen, answer, n)
+    return Expert(answer, path.name, n, m, digest, twin)
+
+
+def _observation_size(session: "Session", path: Path, wanted: int | None) -> int:
+    inputs = session.get_inputs()
+    described = ", ".join(_describe(entry) for entry in inputs)
+    if len(inputs) != 1:
+        raise ExpertError(
+            f"{path} has {len(inputs)} inputs: {described}",
+            "one input (batch, n); policies with memory can't be distilled",
+            "export the policy without its state, or wrap it in a function",
+        )
+    shape, kind = inputs[0].shape, inputs[0].type
+    if kind not in ("tensor(float)", "tensor(double)", "tensor(float16)") or len(shape) != 2:
+        raise ExpertError(
+            f"{path} has the input {described}",
+            "(batch, n) numbers of type float16, float32 or float64",
+            "export the policy for flat observations",
+        )
+    n = shape[1] if isinstance(shape[1], int) else wanted
+    if n is None:
+        raise ExpertError(
+            f"{path} leaves its observation size open: {described}",
+            "a size in the file or from the caller",
+            "write load_expert(path, observation_size=...)",
+        )
+    if wanted is not None and n != wanted:
+        raise ExpertError(
+            f"{path} wants {n} observations, the environment gives {wanted}",
+            "an expert of this environment",
+            "check the environment's version and options (Ant-v4 gives 27, Ant-v5 105)",
+        )
+    return n
+
+
+def _choose_output(
+    session: "Session", path: Path, action_size: int | None, output: str | None
+) -> str:
+    outputs = session.get_outputs()
+    described = ", ".join(_describe(entry) for entry in outputs)
+    if output is not None:
+        if output not in [entry.name for entry in outputs]:
+            raise ExpertError(
+                f"{path} has no output {output!r}", f"one of {described}", "choose one of these"
+            )
+        return output
+    fitting = [entry.name for entry in outputs if _could_be_actions(entry, action_size)]
+    if len(fitting) != 1:
+        raise ExpertError(
+            f"{path} has {len(fitting)} outputs that could be the actions: {described}",
+            f"one floating-point output (batch, {action_size or 'm'})",
+            'name it: output="..." (--output on the command line)'
+            if fitting
+            else "check that expert and environment belong together",
+        )
+    return fitting[0]
+
+
+def _could_be_actions(entry: "onnxruntime.NodeArg", action_size: int | None) -> bool:
+    if entry.type not in ("tensor(float)", "tensor(double)", "tensor(float16)"):
+        return False
+    # An exporter may leave the shape open; then only asking tells.
+    if not entry.shape or not isinstance(entry.shape[-1], int):
+        return True
+    return len(entry.shape) == 2 and action_size in (None, entry.shape[-1])
+
+
+def _answer(model: "onnx.ModelProto", session: "Session", output: str, n: int) -> Answer:
+    """Return the fastest way to ask that gives the answers of single rows."""
+    if is_batched(session):
+        return lambda rows: run_session(session, output, rows)
+    size = session.get_inputs()[0].shape[0]
+
+    def in_turn(rows: np.ndarray) -> np.ndarray:
+        padded = np.concatenate([rows, np.zeros((-len(rows) % size, n), np.float32)])
+        parts = [
+            run_session(session, output, padded[start : start + size])
+            for start in range(0, len(padded), size)
+        ]
+        return np.concatenate(parts)[: len(rows)]
+
+    try:
+        free = open_session(rebatched(model), "the re-batched model")
+    except ExpertError:
+        return _slow(in_turn, size, n)
+
+    def at_once(rows: np.ndarray) -> np.ndarray:
+        return run_session(free, output, rows)
+
+    return at_once if _agree(at_once, in_turn, n) else _slow(in_turn, size, n)
+
+
+def _agree(at_once: Answer, in_turn: Answer, n: int) -> bool:
+    rows = np.random.default_rng(0).standard_normal((17, n)).astype(np.float32)
+    try:
+        fast, slow = at_once(rows), in_turn(rows)
+    except Exception:  # a constant inside the graph still wants the old batch
+        return False
+    return fast.shape == slow.shape and np.allclose(fast, slow, rtol=1e-4, atol=1e-5)
+
+
+def _slow(in_turn: Answer, size: int, n: int) -> Answer:
+    rows = np.zeros((64 * size, n), np.float32)
+    in_turn(rows[:size])
+    start = time.perf_counter()
+    in_turn(rows)
+    seconds = (time.perf_counter() - start) / len(rows)
+    warnings.warn(
+        f"the model takes {size} row(s) at a time and can't be re-batched: asked in turn, "
+        f"{1e6 * seconds:.0f} microseconds a row (batches are about ten times faster); "
+        "export it with a free batch dimension to mend this",
+        FdtasilWarning,
+        stacklevel=4,
+    )
+    return in_turn
+
+
+def _describe(entry: "onnxruntime.NodeArg") -> str:
+    kind = entry.type.removeprefix("tensor(").removesuffix(")")
+    return f"{entry.name} {kind} ({', '.join(str(size) for size in entry.shape)})"

@@ -1,0 +1,155 @@
+"""A differentiable torch twin of an MLP-type ONNX graph: the analytic reference."""
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+if TYPE_CHECKING:
+    import onnx
+
+__all__ = ["torch_twin"]
+
+Operator = Callable[..., Tensor]
+
+_AGREEMENT = 1e-4  # relative to the largest action; float32 networks reach 1e-6
+
+
+def torch_twin(
+    model: "onnx.ModelProto",
+    output: str,
+    answer: Callable[[np.ndarray], np.ndarray],
+    observation_size: int,
+) -> torch.nn.Module | None:
+    """Build a torch module that computes what an MLP-type ONNX model computes.
+
+    Args:
+        model: With its weights loaded.
+        output: Name of the output that holds the actions.
+        answer: The session's own answers, which the twin is held against on random states.
+        observation_size: n.
+
+    Returns:
+        The twin, float32, or None where the graph has an operator that is not one of an MLP, or
+        the twin does not agree with the session.
+    """
+    import onnx
+
+    try:
+        twin = _Twin(model, output)
+    except (KeyError, ValueError, onnx.shape_inference.InferenceError):
+        return None
+    rows = np.random.default_rng(0).standard_normal((64, observation_size)).astype(np.float32)
+    expected = answer(rows)
+    try:
+        with torch.no_grad():
+            answers = twin(torch.from_numpy(rows)).numpy()
+    except (RuntimeError, TypeError, ValueError, IndexError, KeyError):
+        return None
+    tolerance = _AGREEMENT * max(1.0, float(np.abs(expected).max()))
+    agrees = answers.shape == expected.shape and np.abs(answers - expected).max() <= tolerance
+    return twin if agrees else None
+
+
+class _Twin(torch.nn.Module):
+    """Runs the nodes of a graph in their order; the order of an ONNX graph is topological."""
+
+    def __init__(self, model: "onnx.ModelProto", output: str) -> None:
+        import onnx
+
+        super().__init__()
+        graph = model.graph
+        self._constants = {
+            tensor.name: _float32(onnx.numpy_helper.to_array(tensor))
+            for tensor in graph.initializer
+        }
+        self._input, self._output = graph.input[0].name, output
+        self._nodes = [
+            (
+                OPERATORS[node.op_type],
+                list(node.input),
+                node.output[0],
+                {a.name: onnx.helper.get_attribute_value(a) for a in node.attribute},
+            )
+            for node in graph.node
+        ]
+
+    def forward(self, observations: Tensor) -> Tensor:
+        """(B, n) float32 -> (B, m) float32."""
+        values: dict[str, Any] = {"": None, self._input: observations}
+        for name, constant in self._constants.items():
+            values[name] = constant.to(observations.device)
+        for operator, inputs, output, attributes in self._nodes:
+            values[output] = operator(*(values[name] for name in inputs), **attributes)
+        return values[self._output]
+
+
+def _float32(array: np.ndarray) -> Tensor:
+    """Return weights as float32, and shapes and axes as they are."""
+    tensor = torch.from_numpy(np.array(array))
+    return tensor.float() if tensor.is_floating_point() else tensor
+
+
+def _gemm(
+    a: Tensor,
+    b: Tensor,
+    c: Tensor | None = None,
+    alpha: float = 1.0,
+    beta: float = 1.0,
+    transA: int = 0,
+    transB: int = 0,
+) -> Tensor:
+    product = alpha * ((a.T if transA else a) @ (b.T if transB else b))
+    return product if c is None else product + beta * c
+
+
+def _clip(x: Tensor, low: Tensor | None = None, high: Tensor | None = None) -> Tensor:
+    return x.clamp(low, high) if low is not None or high is not None else x
+
+
+def _constant(value: "onnx.TensorProto") -> Tensor:
+    import onnx
+
+    return _float32(onnx.numpy_helper.to_array(value))
+
+
+def _gelu(x: Tensor, approximate: bytes = b"none") -> Tensor:
+    return torch.nn.functional.gelu(x, approximate=approximate.decode())
+
+
+def _slice(x: Tensor, starts: Tensor, ends: Tensor, axes: Tensor, steps: Tensor) -> Tensor:
+    if axes.tolist() != [1] or steps.tolist() != [1]:
+        raise ValueError("only slices of columns")
+    return x[:, int(starts[0]) : int(ends[0])]
+
+
+OPERATORS: dict[str, Operator] = {
+    "Abs": torch.abs,
+    "Add": torch.add,
+    "Cast": lambda x, to: x,  # the twin computes in float32 throughout
+    "Clip": _clip,
+    "Concat": lambda *parts, axis: torch.cat(parts, dim=axis),
+    "Constant": _constant,
+    "Div": torch.div,
+    "Elu": lambda x, alpha=1.0: torch.nn.functional.elu(x, alpha),
+    "Erf": torch.erf,
+    "Exp": torch.exp,
+    "Flatten": lambda x, axis=1: x.flatten(axis),
+    "Gelu": _gelu,
+    "Gemm": _gemm,
+    "Identity": lambda x: x,
+    "LeakyRelu": lambda x, alpha=0.01: torch.nn.functional.leaky_relu(x, alpha),
+    "MatMul": torch.matmul,
+    "Mul": torch.mul,
+    "Neg": torch.neg,
+    "Relu": torch.relu,
+    "Selu": torch.nn.functional.selu,
+    "Sigmoid": torch.sigmoid,
+    "Slice": _slice,
+    "Softplus": torch.nn.functional.softplus,
+    "Sqrt": torch.sqrt,
+    "Sub": torch.sub,
+    "Tanh": torch.tanh,
+}

@@ -1,0 +1,81 @@
+"""Pictures of a run; matplotlib is loaded when one is drawn."""
+
+import io
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from fdtasil.evaluation import Evaluation
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["draw_returns", "draw_training"]
+
+_STUDENT, _EXPERT = "#1f77b4", "#444444"
+
+
+def draw_training(history: Sequence[dict[str, float]]) -> bytes:
+    """Draw the action error and the derivative error against the training step, as a PNG."""
+    with_probes = any(entry["derivative_error"] > 0 for entry in history)
+    figure = _figure(7.0, 3.0)
+    panels = figure.subplots(1, 2 if with_probes else 1, squeeze=False)[0]
+    steps = _cumulative_steps(history)
+    names = ("action_error", "derivative_error")
+    titles = ("action error (norm)", "derivative error (norm of the whitened Jacobian's)")
+    for panel, name, title in zip(panels, names, titles, strict=False):
+        panel.plot(steps, [entry[name] for entry in history], color=_STUDENT, linewidth=1.4)
+        panel.set_yscale("log")
+        panel.set_title(title, fontsize=9)
+        panel.set_xlabel("training step")
+        panel.grid(alpha=0.3, which="both", linewidth=0.5)
+    return _png(figure)
+
+
+def draw_returns(evaluation: Evaluation) -> bytes:
+    """Draw each episode's return of the student against the expert's, as a PNG."""
+    figure = _figure(7.0, 3.2)
+    panel = figure.subplots()
+    order = sorted(range(evaluation.episodes), key=lambda e: evaluation.expert_returns[e])
+    places = range(1, evaluation.episodes + 1)
+    for place, episode in zip(places, order, strict=True):
+        ends = evaluation.expert_returns[episode], evaluation.student_returns[episode]
+        panel.plot([place, place], ends, color="#bbbbbb", linewidth=1, zorder=1)
+    expert = [evaluation.expert_returns[e] for e in order]
+    student = [evaluation.student_returns[e] for e in order]
+    panel.scatter(places, expert, marker="s", s=22, color=_EXPERT, label="expert", zorder=2)
+    panel.scatter(places, student, marker="o", s=26, color=_STUDENT, label="student", zorder=3)
+    low, high = evaluation.ci95
+    panel.set_title(
+        f"normalised return {evaluation.normalized_return:.3f}, 95 % [{low:.3f}, {high:.3f}], "
+        f"survival {evaluation.survival:.2f}",
+        fontsize=9,
+    )
+    panel.set_xlabel("evaluation episode, in the order of the expert's return")
+    panel.set_ylabel(f"return over {evaluation.horizon} steps")
+    panel.set_ylim(bottom=min(0.0, *expert, *student))
+    panel.grid(alpha=0.3, axis="y", linewidth=0.5)
+    panel.legend(frameon=False, fontsize=8, loc="lower left", ncols=2)
+    return _png(figure)
+
+
+def _cumulative_steps(history: Sequence[dict[str, float]]) -> list[float]:
+    """Return the steps counted on over the rounds, each of which counts from zero."""
+    steps, base, last = [], 0.0, 0.0
+    for entry in history:
+        if entry["step"] <= last:
+            base += last
+        last = entry["step"]
+        steps.append(base + last)
+    return steps
+
+
+def _figure(width: float, height: float) -> "Figure":
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def _png(figure: "Figure") -> bytes:
+    target = io.BytesIO()
+    figure.savefig(target, format="png", dpi=150, metadata={"Software": None})
+    return target.getvalue()

@@ -1,0 +1,257 @@
+"""ONNX files: read safely, answer in batches whatever batch they were exported with, write.
+
+onnx and onnxruntime are imported inside the functions, so that `import fdtasil` needs neither.
+"""
+
+import logging
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from fdtasil.errors import ExpertError, ExportError
+from fdtasil.storage import sha256
+
+if TYPE_CHECKING:
+    import onnx
+    import onnxruntime
+
+__all__ = ["export_module", "is_batched", "open_session", "read_model", "rebatched", "run_session"]
+
+_OPSET = 18  # old enough for the runtimes on robots, new enough for torch's exporter
+_SIZE_LIMIT = 256 * 2**20
+
+_IMPOSTORS = {
+    b"<": ("an HTML or XML page", "download the file itself, not the page about it"),
+    b"version https://git-lfs": ("a git-LFS pointer", "run `git lfs pull`"),
+    b"\x80": ("a Python pickle", "export the controller to ONNX; pickles are never opened"),
+    b"PK\x03\x04": (
+        "a zip; if stable-baselines3 wrote it, it is an agent and not a model",
+        "export the agent to ONNX first",
+    ),
+}
+
+
+def read_model(path: Path) -> "tuple[onnx.ModelProto, str]":
+    """Read an ONNX file with its weights, also where they lie in a side file.
+
+    Nothing outside the model's own folder is read, and no code of the file is run.
+
+    Returns:
+        The model, and the sha256 of its file (followed by its side files, where it has any).
+
+    Raises:
+        ExpertError: If it is missing, not ONNX, over 256 MiB, or its side file can't be used.
+    """
+    import onnx
+
+    path = Path(path)
+    data = _read_bytes(path)
+    for magic, (found, next_step) in _IMPOSTORS.items():
+        if data.startswith(magic):
+            raise ExpertError(f"{path} is {found}", "an ONNX model", next_step)
+    try:
+        model = onnx.load_model_from_string(data)
+    except Exception:
+        model = None
+    if model is None or not model.graph.node:
+        raise ExpertError(
+            f"{path} is no whole ONNX model ({len(data):,} bytes)",
+            "a file written by an ONNX exporter",
+            "copy or export it again",
+        )
+    folder, side_files = path.resolve().parent, sorted(_side_files(model))
+    try:
+        onnx.load_external_data_for_model(model, str(folder))
+        data += b"".join((folder / name).read_bytes() for name in side_files)
+    except Exception as error:
+        raise ExpertError(
+            f"{path} keeps weights in {', '.join(side_files)}: {_first_line(error)}",
+            f"a plain file of that name in {folder}",
+            "copy both files together under their old names, or export with external_data=False",
+        ) from error
+    return model, sha256(data)
+
+
+def open_session(model: "onnx.ModelProto", name: str) -> "onnxruntime.InferenceSession":
+    """Open a model on one CPU thread.
+
+    Raises:
+        ExpertError: If onnxruntime can't run it, with its reason in one line.
+    """
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    # One thread and no spinning: the default slows torch in the same process many times over.
+    options.intra_op_num_threads = options.inter_op_num_threads = 1
+    options.add_session_config_entry("session.intra_op.allow_spinning", "0")
+    options.enable_mem_pattern = False  # memory grows with every new batch size otherwise
+    options.log_severity_level = 4
+    try:
+        return onnxruntime.InferenceSession(
+            model.SerializeToString(), options, providers=["CPUExecutionProvider"]
+        )
+    except Exception as error:
+        opset = max(entry.version for entry in model.opset_import)
+        raise ExpertError(
+            f"onnxruntime {onnxruntime.__version__} can't run {name}: {_first_line(error)}",
+            "standard operators in a version it knows "
+            f"(this file: opset {opset}, IR {model.ir_version})",
+            "upgrade onnxruntime, or export again with an older opset such as 17",
+        ) from error
+
+
+def run_session(
+    session: "onnxruntime.InferenceSession", output: str, observations: np.ndarray
+) -> np.ndarray:
+    """Answer one batch, casting to the type the model wants and back to float32."""
+    entry = session.get_inputs()[0]
+    wanted = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
+    batch = observations.astype(wanted.get(entry.type, np.float64), copy=False)
+    return np.asarray(session.run([output], {entry.name: batch})[0]).astype(np.float32, copy=False)
+
+
+def is_batched(session: "onnxruntime.InferenceSession") -> bool:
+    """Whether the model's first dimension is free."""
+    return not isinstance(session.get_inputs()[0].shape[0], int)
+
+
+def rebatched(model: "onnx.ModelProto") -> "onnx.ModelProto":
+    """Return a copy whose first input and output dimensions are free instead of fixed."""
+    import onnx
+
+    copy = onnx.ModelProto()
+    copy.CopyFrom(model)
+    for value in (*copy.graph.input, *copy.graph.output):
+        if value.type.tensor_type.shape.dim:
+            value.type.tensor_type.shape.dim[0].dim_param = "batch"
+    del copy.graph.value_info[:]  # shapes inferred for the fixed batch
+    return copy
+
+
+def export_module(
+    module: torch.nn.Module, observations: np.ndarray, metadata: Mapping[str, str]
+) -> bytes:
+    """Write a torch policy as one self-contained ONNX file, and compare the two.
+
+    The graph has one input `obs` (batch, n), one output `actions` (batch, m), both float32, and
+    a free batch. Equal modules give equal bytes.
+
+    Args:
+        module: (B, n) -> (B, m) float32, put into evaluation mode while it is exported.
+        observations: (B, n) float32 real states to compare on; B at least 2.
+        metadata: Text entries of the file's `metadata_props`.
+
+    Returns:
+        The file's bytes.
+
+    Raises:
+        ExportError: If the export fails, an answer is not finite, or the file's answers differ
+            from torch's by more than 1e-5 (relative to the largest action, if that is over 1).
+    """
+    import onnx
+
+    example = torch.from_numpy(np.ascontiguousarray(observations, np.float32))
+    training = module.training
+    module.eval()
+    try:
+        model = _export_graph(module, example)
+        with torch.no_grad():
+            expected = module(example).numpy()
+    finally:
+        module.train(training)
+    onnx.helper.set_model_props(model, dict(metadata))
+    session = open_session(model, "the export")
+    answers = run_session(session, "actions", example.numpy())
+    difference = float(np.abs(answers - expected).max())
+    if not difference <= 1e-5 * max(1.0, float(np.abs(expected).max())):  # catches NaN as well
+        raise ExportError(
+            f"the ONNX file and torch differ by {difference:.1e} on {len(example)} states",
+            "at most 1e-5, on finite answers",
+            "check the module for layers that behave differently in training, or for NaN weights",
+        )
+    return model.SerializeToString(deterministic=True)
+
+
+def _export_graph(module: torch.nn.Module, example: torch.Tensor) -> "onnx.ModelProto":
+    try:
+        with _silenced():
+            program = torch.onnx.export(
+                module,
+                (example[:2],),
+                dynamo=True,
+                external_data=False,
+                opset_version=_OPSET,
+                input_names=["obs"],
+                output_names=["actions"],
+                dynamic_shapes=({0: torch.export.Dim("batch")},),
+                verbose=False,
+            )
+        assert program is not None  # for the type checker: dynamo=True always returns one
+        model = program.model_proto
+    except Exception as error:
+        raise ExportError(
+            f"torch can't export {type(module).__name__}: {_first_line(error)}",
+            "a module made of operations that ONNX has",
+            "replace the operation named above",
+        ) from error
+    # The exporter writes stack traces with folder names of this machine into every node.
+    for part in (*model.graph.node, *model.graph.value_info, model.graph, *model.functions):
+        del part.metadata_props[:]
+        part.doc_string = ""
+    return model
+
+
+@contextmanager
+def _silenced() -> Iterator[None]:
+    """Keep the exporter's remarks about its own internals away from the user."""
+    before = logging.root.manager.disable
+    logging.disable(logging.WARNING)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logging.disable(before)
+
+
+def _read_bytes(path: Path) -> bytes:
+    if path.is_dir():
+        inside = ", ".join(sorted(p.name for p in path.glob("*.onnx"))[:5]) or "none"
+        raise ExpertError(
+            f"{path} is a folder (ONNX files inside: {inside})",
+            "an ONNX file",
+            "name the file itself",
+        )
+    try:
+        size = path.stat().st_size
+        if not 0 < size <= _SIZE_LIMIT:
+            raise ExpertError(
+                f"{path} has {size:,} bytes",
+                f"1 to {_SIZE_LIMIT:,} bytes",
+                "check that this is the right file",
+            )
+        return path.read_bytes()
+    except OSError as error:
+        raise ExpertError(
+            f"{path.absolute()} can't be read: {error.strerror}",
+            f"an ONNX file (relative paths start at {Path.cwd()})",
+            "check the path",
+        ) from error
+
+
+def _side_files(model: "onnx.ModelProto") -> set[str]:
+    return {
+        entry.value
+        for tensor in model.graph.initializer
+        for entry in tensor.external_data
+        if entry.key == "location"
+    }
+
+
+def _first_line(error: Exception) -> str:
+    return (str(error).strip().splitlines() or [type(error).__name__])[0][:200]

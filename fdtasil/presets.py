@@ -1,0 +1,101 @@
+"""Every default of the method, written once; a preset is a named set of them."""
+
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+from fdtasil.errors import SettingError
+from fdtasil.fit import Fit
+from fdtasil.probes import Probes
+
+__all__ = ["PRESETS", "Preset", "preset_of"]
+
+
+@dataclass(frozen=True)
+class Preset:
+    """The defaults that a call leaves open.
+
+    Attributes:
+        radius: Of the probes; see `Probes`.
+        space: Of the probes.
+        per_step: Of the probes.
+        hidden: Widths of the student's hidden layers.
+        activation: The student's.
+        fit: The optimisation.
+    """
+
+    radius: float
+    space: Literal["whitened", "raw"]
+    per_step: int | Literal["all"]
+    hidden: tuple[int, ...]
+    activation: str
+    fit: Fit
+
+    def complete(self, probes: Probes | None) -> Probes | None:
+        """Fill in what a derivative source leaves open."""
+        if probes is None:
+            return None
+        return replace(
+            probes,
+            radius=self.radius if probes.radius is None else probes.radius,
+            space=self.space if probes.space is None else probes.space,
+            per_step=self.per_step if probes.per_step is None else probes.per_step,
+        )
+
+    def fit_with(self, **given: float | None) -> Fit:
+        """Return the optimisation with the fields of `Fit` that are given (not None) put in."""
+        changes: dict[str, Any] = {k: value for k, value in given.items() if value is not None}
+        # Steps and epochs are two ways to say one thing: saying one unsays the other.
+        if "steps" in changes or "epochs" in changes:
+            changes = {"steps": None, "epochs": None, **changes}
+        return replace(self.fit, **changes)
+
+
+PRESETS = {
+    "standard": Preset(
+        radius=0.2,
+        space="whitened",
+        per_step=1,
+        hidden=(512, 512),
+        activation="gelu",
+        fit=Fit(
+            steps=4000,
+            epochs=None,
+            batch_size=100,
+            learning_rate=1e-3,
+            weight_decay=0.01,
+            epsilon=1e-8,
+            weight=0.5,
+        ),
+    ),
+    # TaSIL, appendices on experiments and finite differences. The weight multiplies the norm of
+    # the whole Jacobian's error there; `gain` makes it mean that for any number of probes here.
+    "paper": Preset(
+        radius=0.01,
+        space="raw",
+        per_step="all",
+        hidden=(512, 512),
+        activation="gelu",
+        fit=Fit(
+            steps=None,
+            epochs=4500,
+            batch_size=100,
+            learning_rate=1e-3,
+            weight_decay=0.01,
+            epsilon=1e-4,
+            weight=0.01,
+        ),
+    ),
+}
+
+
+def preset_of(name: str) -> Preset:
+    """Return the preset of that name.
+
+    Raises:
+        SettingError: If there is none.
+    """
+    if name not in PRESETS:
+        raise SettingError(
+            f"preset={name!r}", f"one of {', '.join(PRESETS)}", "choose one of these"
+        )
+    return PRESETS[name]

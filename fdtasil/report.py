@@ -1,0 +1,86 @@
+"""What a run says of itself: `report.json`, and the warnings on the way."""
+
+import platform
+import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
+from importlib.metadata import version
+from typing import Any
+
+from fdtasil.configuration import Configuration
+from fdtasil.errors import FdtasilWarning
+from fdtasil.evaluation import Evaluation
+from fdtasil.rounds import Rounds
+
+__all__ = ["noted_warnings", "report_of", "versions"]
+
+_VERSIONED = ("fdtasil", "torch", "numpy", "gymnasium", "mujoco", "onnx", "onnxruntime")
+
+
+def versions() -> dict[str, str]:
+    """Return the versions that a run's bytes depend on."""
+    return {"python": platform.python_version()} | {name: version(name) for name in _VERSIONED}
+
+
+def report_of(
+    configuration: Configuration,
+    evaluation: Evaluation,
+    rounds: Rounds,
+    *,
+    steps: int,
+    train_seconds: float,
+    matmul_precision: str,
+    notes: list[str],
+) -> dict[str, Any]:
+    """Return what `report.json` holds, as plain JSON values.
+
+    Args:
+        configuration: The run's.
+        evaluation: Student against expert.
+        rounds: After the last round.
+        steps: Gradient steps of all rounds.
+        train_seconds: Wall-clock seconds of collecting, probing and training.
+        matmul_precision: torch's float32 matrix-product precision in force.
+        notes: Warnings on the way.
+    """
+    plain = configuration.to_json()
+    probes, predicted = configuration.probes, configuration.predicted_queries()
+    return {
+        "expert": {
+            "path": configuration.expert,
+            "sha256": configuration.expert_sha256,
+            "return_mean": evaluation.expert_return,
+        },
+        **{name: plain[name] for name in ("env", "trainer", "probes", "seed")},
+        "radius": probes.radius if probes else None,
+        "versions": versions(),
+        "evaluation": evaluation.to_json(),
+        "queries": {name: rounds.expert.queries[name] for name in predicted},
+        "predicted_queries": predicted,
+        "states": len(rounds.labelled),
+        "frozen_coordinates": rounds.frozen_coordinates,
+        "clipped_actions": rounds.counts["clipped_actions"],
+        "physics_resets": rounds.counts["physics_resets"],
+        "terminated_episodes": rounds.counts["terminated_episodes"],
+        "steps": steps,
+        "train_seconds": round(train_seconds, 2),
+        "matmul_precision": matmul_precision,
+        "warnings": notes,
+    }
+
+
+@contextmanager
+def noted_warnings() -> Iterator[list[str]]:
+    """Keep the library's warnings in a list as well as showing them, each time they occur."""
+    notes: list[str] = []
+    with warnings.catch_warnings():
+        warnings.filterwarnings("always", category=FdtasilWarning, append=True)
+        shown = warnings.showwarning
+
+        def note(message: Warning | str, category: type[Warning], *where: Any) -> None:
+            if issubclass(category, FdtasilWarning):
+                notes.append(str(message))
+            shown(message, category, *where)
+
+        warnings.showwarning = note  # catch_warnings puts the old one back
+        yield notes
