@@ -24,6 +24,7 @@ os.environ["JAX_PLATFORMS"] = "cpu"
 os.environ["XLA_FLAGS"] = "--xla_cpu_multi_thread_eigen=false intra_op_parallelism_threads=1"
 
 import argparse
+import contextlib
 import csv
 import json
 import math
@@ -223,10 +224,8 @@ def draw_curve(history, record, path):
 def installed_versions():
     versions = {}
     for package in PACKAGES:
-        try:
+        with contextlib.suppress(PackageNotFoundError):  # sbx and jax are optional
             versions[package] = version(package)
-        except PackageNotFoundError:
-            pass  # sbx and jax are optional
     return versions
 
 

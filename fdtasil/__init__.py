@@ -1,10 +1,11 @@
 """Distil a black-box controller into a small torch policy that reacts as it does.
 
 >>> import fdtasil
->>> result = fdtasil.distill("experts/HalfCheetah-v5.onnx", "HalfCheetah-v5", probes=10,
-...                          episodes=1, horizon=20, steps=10, evaluation_episodes=2)
->>> result.queries["probe"]
-200
+    import fdtasil
+
+    result = fdtasil.distill("experts/HalfCheetah-v5.onnx", "HalfCheetah-v5", probes=10)
+    print(result.evaluation)
+    result.to_onnx("student.onnx")
 """
 
 from fdtasil.distilled import Distilled

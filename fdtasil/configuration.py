@@ -6,7 +6,6 @@ from typing import Any
 from fdtasil.errors import SettingError
 from fdtasil.fit import Fit
 from fdtasil.probes import Probes
-from fdtasil.seeding import check_seed
 from fdtasil.student import StudentShape
 from fdtasil.trainers import Trainer
 
@@ -51,7 +50,6 @@ class Configuration:
     max_queries: int | None
 
     def __post_init__(self) -> None:
-        check_seed(self.seed)
         check_count("episodes", self.episodes)
         check_count("evaluation_episodes", self.evaluation_episodes)
 
@@ -100,7 +98,7 @@ class Configuration:
         return plain | {
             "trainer": self.trainer.name,
             "probes": self.probes.describe() if self.probes else "none",
-            "student": asdict(self.student),
+            "student": {**asdict(self.student), "hidden": list(self.student.hidden)},
             "fit": asdict(self.fit),
         }
 

@@ -40,9 +40,9 @@ class Distilled:
         answers: The expert's answers to the probes, or None.
 
     Example:
-        >>> import fdtasil
+        >>> import fdtasil, numpy as np
         >>> result = fdtasil.distill(
-        ...     lambda x: -x[:, 1:2] - x[:, 2:3], "Pendulum-v1", probes=2,
+        ...     lambda x: 1.5 * np.tanh(-x[:, 2:3]), "Pendulum-v1", probes=2,
         ...     episodes=1, horizon=20, steps=20, hidden=(8,), evaluation_episodes=2,
         ... )
         >>> result.queries["probe"]

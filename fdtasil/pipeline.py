@@ -96,7 +96,7 @@ def distill(
 
     Example:
         >>> result = distill(
-        ...     lambda observations: -2 * observations[:, 2:3], "Pendulum-v1", probes=4,
+        ...     lambda observations: 1.5 * np.tanh(-observations[:, 2:3]), "Pendulum-v1", probes=4,
         ...     episodes=2, horizon=50, steps=50, hidden=(16,), evaluation_episodes=2,
         ... )
         >>> result.student.predict(result.demonstrations.observations[0])[0].shape
@@ -130,7 +130,7 @@ def distill(
             fit=optimisation,
             episodes=episodes,
             horizon=resolve_horizon(horizon, pool),
-            seed=seed,
+            seed=check_seed(seed),
             device=device,
             evaluation_episodes=evaluation_episodes,
             max_queries=max_queries,
@@ -202,7 +202,7 @@ def evaluate(
 
     Example:
         >>> def swing(observations):
-        ...     return -2 * observations[:, 2:3]
+        ...     return 1.5 * np.tanh(-observations[:, 2:3])
         >>> evaluate(swing, swing, "Pendulum-v1", episodes=2, horizon=50).normalized_return
         1.0
     """

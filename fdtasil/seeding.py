@@ -34,8 +34,8 @@ def generator(seed: int, *path: str | int) -> np.random.Generator:
         *path: The stream's name, for example `("rollout", 0, 3)`.
 
     Example:
-        >>> generator(0, "noise", 1).integers(10) == generator(0, "noise", 1).integers(10)
-        True
+        >>> generator(0, "noise", 1).random() - generator(0, "noise", 1).random()
+        0.0
     """
     return np.random.default_rng(_sequence(seed, path))
 

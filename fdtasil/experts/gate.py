@@ -51,8 +51,6 @@ def examine_expert(expert: Expert, observations: np.ndarray, boxes: Boxes) -> li
         alone = np.concatenate([expert.ask(row[None], "check") for row in observations])
     except ExpertError as error:
         return [Finding("answers", error.found, error)]
-    if answers.shape[1] != boxes.action_size:
-        return [_wrong_size(expert, answers, boxes)]
     probe = _Probe(expert, observations, answers, boxes)
     found = Finding("answers", f"{answers.shape[1]} finite numbers for each observation", None)
     return [
@@ -154,15 +152,6 @@ class _Probe:
     def _range(self) -> float:
         bounded = (self.boxes.high - self.boxes.low)[np.isfinite(self.boxes.high)]
         return float(bounded.min()) if bounded.size else max(1.0, float(np.ptp(self.answers)))
-
-
-def _wrong_size(expert: Expert, answers: np.ndarray, boxes: Boxes) -> Finding:
-    problem = ExpertError(
-        f"{expert.name} answers with {answers.shape[1]} actions",
-        f"{boxes.action_size} actions, as the environment takes",
-        "check that the expert belongs to this environment and version",
-    )
-    return Finding("answers", problem.found, problem)
 
 
 def _numbers(values: np.ndarray) -> str:

@@ -58,8 +58,13 @@ def load_expert(
         'the function <lambda>'
     """
     if isinstance(source, Expert):
-        return dataclasses.replace(source, queries=Counter())
-    if isinstance(source, (str, Path)):
+        expert = dataclasses.replace(
+            source,
+            observation_size=source.observation_size or observation_size,
+            action_size=source.action_size or action_size,
+            queries=Counter(),
+        )
+    elif isinstance(source, (str, Path)):
         expert = open_onnx(Path(source), observation_size, action_size, output)
     elif isinstance(source, torch.nn.Module):
         expert = _from_module(source, action_size)

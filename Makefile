@@ -1,0 +1,33 @@
+# make demo, make test: each makes the environment first, if need be.
+PYTHON ?= python3
+BIN = .venv/bin
+# One thread per process: several at once on few cores are many times slower otherwise.
+export OMP_NUM_THREADS = 1
+
+.PHONY: demo test lint types check clean
+
+demo: .venv/ready
+	$(BIN)/fdtasil distill experts/HalfCheetah-v5.onnx HalfCheetah-v5 --probes 10 \
+		--episodes 5 --horizon 300 --compare --out runs/demo
+
+test: .venv/ready
+	$(BIN)/python -m pytest -q -n 2 -m "not slow"
+
+lint: .venv/ready
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: .venv/ready
+	$(BIN)/pyright
+
+check: lint types test
+
+# torch goes first and pinned: left to itself pip would take a build with gigabytes of CUDA.
+.venv/ready: pyproject.toml constraints.txt
+	$(PYTHON) -m venv .venv
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt torch
+	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev]"
+	touch $@
+
+clean:
+	rm -rf .venv build dist

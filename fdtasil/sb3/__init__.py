@@ -1,0 +1,12 @@
+"""Agents of stable-baselines3 as torch modules and ONNX files, read without running their code.
+
+A zip that stable-baselines3 wrote holds pickles, and a pickle runs any code when it is opened. The
+numbers of a policy stand outside of them: `policy.pth` is read by torch's `weights_only` reader,
+and what has to be known besides (class names, the activation, the action bounds) is there as text.
+`trust="pickle"` hands the zip to stable-baselines3 instead; nothing else imports that library.
+"""
+
+from fdtasil.sb3.agent import Agent, read_agent
+from fdtasil.sb3.export import export_sb3
+
+__all__ = ["Agent", "export_sb3", "read_agent"]

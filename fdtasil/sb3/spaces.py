@@ -1,0 +1,107 @@
+"""The two spaces of an agent, from the text that stands beside their pickles."""
+
+import re
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from fdtasil.errors import ExpertError, SettingError
+
+__all__ = ["Bounds", "given_bounds", "read_bounds", "read_size"]
+
+_BOX = re.compile(r"<class '(?:gym|gymnasium)\.spaces\.box\.Box'>")
+_ADVICE = {
+    "observation_space": "train on flat observations (gymnasium.wrappers.FlattenObservation)",
+    "action_space": "fdtasil distils continuous controllers only; choose another agent",
+}
+
+
+@dataclass(frozen=True)
+class Bounds:
+    """The action bounds of an agent, (m,) float32 each."""
+
+    low: np.ndarray
+    high: np.ndarray
+
+
+def read_size(record: Mapping[str, Any], name: str, source: str) -> int:
+    """Return the length of a flat continuous space, n or m.
+
+    Raises:
+        ExpertError: If the space is another one.
+    """
+    entry = record.get(name)
+    entry = entry if isinstance(entry, dict) else {}
+    shape = entry.get("_shape", entry.get("shape"))  # gym called it shape until 0.19
+    kind = str(entry.get(":type:"))
+    flat = isinstance(shape, list) and len(shape) == 1 and isinstance(shape[0], int)
+    continuous = name != "action_space" or "float" in str(entry.get("dtype"))
+    if not _BOX.fullmatch(kind) or not flat or not continuous:
+        raise ExpertError(
+            f"{source} has an {name.replace('_', ' ')} of {kind}, shape {shape}, "
+            f"dtype {entry.get('dtype')}",
+            "a Box of floats with one dimension",
+            _ADVICE[name],
+        )
+    return shape[0]
+
+
+def read_bounds(record: Mapping[str, Any], size: int, source: str) -> Bounds:
+    """Return the action bounds as printed by numpy: to eight digits.
+
+    Raises:
+        ExpertError: If the text is abbreviated or is not bounds.
+    """
+    low, high = (
+        _numbers(str(record["action_space"].get(side)), size, f"{source}: {side} of the actions")
+        for side in ("low", "high")
+    )
+    if not (low <= high).all():
+        raise ExpertError(
+            f"{source}: action bounds {low} to {high}", "low at most high", "pass them yourself"
+        )
+    return Bounds(low, high)
+
+
+def given_bounds(low: ArrayLike | None, high: ArrayLike | None, size: int) -> Bounds | None:
+    """Return the caller's own bounds, or None where there are none.
+
+    Raises:
+        SettingError: If only one is given, or one has another length.
+    """
+    if low is None and high is None:
+        return None
+    try:
+        pair = [np.broadcast_to(np.asarray(x, np.float32), (size,)).copy() for x in (low, high)]
+    except (TypeError, ValueError):
+        pair = []
+    if not pair or not (pair[0] <= pair[1]).all():
+        raise SettingError(
+            f"action_low={low!r}, action_high={high!r}",
+            f"{size} numbers each, low at most high",
+            "pass env.action_space.low and env.action_space.high",
+        )
+    return Bounds(*pair)
+
+
+def _numbers(text: str, size: int, source: str) -> np.ndarray:
+    if "..." in text:
+        raise ExpertError(
+            f"{source} is abbreviated: {text[:60]!r}",
+            f"{size} numbers",
+            "write action_low=env.action_space.low, action_high=env.action_space.high",
+        )
+    try:
+        values = [float(word) for word in text.strip().strip("[]").split()]
+    except ValueError:
+        values = []
+    if len(values) != size:
+        raise ExpertError(
+            f"{source} is {text[:60]!r}",
+            f"{size} numbers",
+            "write action_low=env.action_space.low, action_high=env.action_space.high",
+        )
+    return np.array(values, np.float32)

@@ -1,0 +1,106 @@
+"""Toy experts with known derivatives, and ONNX files as users have them."""
+
+from itertools import pairwise
+from pathlib import Path
+
+import numpy as np
+import onnx
+import pytest
+import torch
+from onnx import TensorProto, helper, numpy_helper
+from toy_environments import Integrator
+
+import fdtasil
+
+GAIN = np.array([[-0.5, 0.1, -0.7, 0.0, 0.0], [0.0, -0.4, 0.1, -0.6, 0.0]], np.float32)
+TOY = "toy_environments:toy/Integrator-v0"
+QUICK = {"episodes": 2, "steps": 40, "hidden": (16,), "evaluation_episodes": 2, "horizon": 20}
+
+SHARED = Path(__file__).parent.parent.parent / "shared"
+
+
+@pytest.fixture(autouse=True, scope="session")
+def one_thread():
+    torch.set_num_threads(1)  # several test processes run at once
+
+
+@pytest.fixture(autouse=True)
+def untouched_global_randomness():
+    """Every test also shows that the library leaves global random state alone."""
+    before = np.random.get_state()[1].copy(), torch.get_rng_state()
+    yield
+    after = np.random.get_state()[1], torch.get_rng_state()
+    assert np.array_equal(before[0], after[0])
+    assert torch.equal(before[1], after[1])
+
+
+@pytest.fixture
+def linear():
+    """The expert x -> GAIN x, whose Jacobian is GAIN everywhere."""
+    return lambda observations: observations @ GAIN.T
+
+
+@pytest.fixture
+def shared():
+    """The folder of the paper's experts, which only developers have."""
+    if not SHARED.is_dir():
+        pytest.skip("needs ../shared, which only developers of fdtasil have")
+    return SHARED
+
+
+@pytest.fixture
+def toy_environment():
+    return Integrator()
+
+
+def mlp_onnx(
+    path: Path,
+    sizes: tuple[int, ...] = (5, 8, 2),
+    kind: int = TensorProto.FLOAT,
+    batch: int | str = "batch",
+    names: tuple[str, str] = ("obs", "actions"),
+    reshape_to: list[int] | None = None,
+    extra_outputs: dict[str, int] | None = None,
+    scale: float = 1.0,
+    external: str | None = None,
+) -> Path:
+    """Write a tanh MLP with seeded weights, in whatever way users' files are odd."""
+    random, dtype = np.random.default_rng(0), helper.tensor_dtype_to_np_dtype(kind)
+    nodes, weights, current = [], [], names[0]
+    outputs = {names[1]: sizes[-1], **(extra_outputs or {})}
+    if reshape_to is not None:
+        weights.append(numpy_helper.from_array(np.array(reshape_to, np.int64), "shape"))
+        nodes.append(helper.make_node("Reshape", [current, "shape"], ["reshaped"]))
+        current = "reshaped"
+    for i, (inputs, width) in enumerate(pairwise(sizes[:-1])):
+        matrix = random.standard_normal((width, inputs)) / inputs**0.5
+        weights += [_tensor(matrix, f"w{i}", dtype), _tensor(np.zeros(width), f"b{i}", dtype)]
+        nodes.append(helper.make_node("Gemm", [current, f"w{i}", f"b{i}"], [f"z{i}"], transB=1))
+        nodes.append(helper.make_node("Tanh", [f"z{i}"], [f"h{i}"]))
+        current = f"h{i}"
+    for name, width in outputs.items():
+        matrix = scale * random.standard_normal((width, sizes[-2])) / sizes[-2]
+        weights += [_tensor(matrix, f"w_{name}", dtype)]
+        nodes.append(helper.make_node("Gemm", [current, f"w_{name}"], [f"z_{name}"], transB=1))
+        nodes.append(helper.make_node("Tanh" if scale == 1 else "Identity", [f"z_{name}"], [name]))
+    graph = helper.make_graph(
+        nodes,
+        "mlp",
+        [helper.make_tensor_value_info(names[0], kind, [batch, sizes[0]])],
+        [helper.make_tensor_value_info(n, kind, [batch, width]) for n, width in outputs.items()],
+        weights,
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
+    save = {"save_as_external_data": True, "location": external, "size_threshold": 0}
+    onnx.save(model, path, **(save if external else {}))
+    return path
+
+
+def _tensor(array: np.ndarray, name: str, dtype: np.dtype) -> onnx.TensorProto:
+    return numpy_helper.from_array(array.astype(dtype), name)
+
+
+@pytest.fixture
+def quick(linear):
+    """A small distillation of the linear expert."""
+    return fdtasil.distill(linear, TOY, 3, **QUICK)

@@ -1,0 +1,84 @@
+"""The shell: the same arguments and defaults as the functions, exit codes, short errors."""
+
+import inspect
+import json
+import os
+import subprocess
+import sys
+
+import pytest
+from conftest import TOY, mlp_onnx
+
+import fdtasil
+from fdtasil.cli import COMMANDS
+
+QUICK = [
+    "--episodes",
+    "2",
+    "--horizon",
+    "20",
+    "--steps",
+    "40",
+    "--hidden",
+    "16",
+    "--evaluation-episodes",
+    "2",
+]
+
+
+def shell(*arguments, cwd="."):
+    environment = {**os.environ, "PYTHONPATH": os.path.dirname(__file__)}
+    command = [sys.executable, "-m", "fdtasil", *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, cwd=cwd, env=environment)
+
+
+@pytest.mark.parametrize("name", ["distill", "evaluate"])
+def test_the_shell_has_the_functions_arguments_and_defaults(name):
+    function = inspect.signature(getattr(fdtasil, name)).parameters
+    command = inspect.signature(COMMANDS[name]).parameters
+    assert set(function) - set(command) == {"progress"}
+    assert set(command) - set(function) <= {"out", "compare"}
+    for argument in set(function) & set(command):
+        default = function[argument].default
+        assert command[argument].default in (default, str(default))
+
+
+def test_inspect_distill_evaluate(tmp_path):
+    expert = mlp_onnx(tmp_path / "e.onnx")
+    shown = shell("inspect", expert, TOY, "--episodes", 2)
+    assert shown.returncode == 0, shown.stderr
+    for promised in ("sha256", "determinism", "batch independence", "action bounds", "return"):
+        assert promised in shown.stdout
+    done = shell("distill", expert, TOY, *QUICK, "--compare", "--out", tmp_path / "run")
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""  # no terminal, no bars
+    for promised in ("expert", "plain cloning", "student", "rows asked of the expert"):
+        assert promised in done.stdout
+    report = json.loads((tmp_path / "run" / "report.json").read_text())
+    assert report["queries"]["probe"] == 400
+    judged = shell("evaluate", tmp_path / "run" / "student.onnx", TOY, "--expert", expert)
+    assert judged.returncode == 0, judged.stderr
+    assert "normalised return" in judged.stdout
+
+
+@pytest.mark.parametrize(
+    ("arguments", "code", "found"),
+    [
+        (["distill", "none.onnx", TOY], 1, "none.onnx can't be read"),
+        (["distill", "EXPERT", TOY, "--probes", "spere:3"], 2, "spere:3"),
+        (["distill", "EXPERT", "Pendulum-v1"], 1, "wants 5 observations"),
+        (["distill", "EXPERT", "NoSuch-v0"], 1, "can't be made"),
+        (["inspect", "EXPERT", "CartPole-v1"], 1, "actions Discrete"),
+        (["distill", "EXPERT", TOY, "--prbes", "3"], 2, "--probes"),
+        (["distil"], 2, "distill"),
+    ],
+)
+def test_an_error_is_short_and_says_the_next_step(arguments, code, found, tmp_path):
+    expert = str(mlp_onnx(tmp_path / "e.onnx"))
+    failed = shell(*[expert if a == "EXPERT" else a for a in arguments], cwd=tmp_path)
+    assert failed.returncode == code
+    assert found in failed.stderr + failed.stdout
+    assert "Traceback" not in failed.stderr
+    if code == 1:
+        assert len(failed.stderr.strip().splitlines()) <= 6
+        assert "next step" in failed.stderr

@@ -1,0 +1,105 @@
+"""Probe designs: a contract for every registered one, and what is special about each."""
+
+import numpy as np
+import pytest
+
+from fdtasil.errors import SettingError
+from fdtasil.probes import (
+    CENTRAL,
+    DIRECTIONS,
+    STENCILS,
+    OrthogonalFrames,
+    Probes,
+    RandomSphere,
+)
+
+COUNTS = {"basis": None, "jacobian": None}
+
+
+@pytest.mark.parametrize("dimension", [1, 3, 17])
+@pytest.mark.parametrize("rows", [1, 40])
+@pytest.mark.parametrize("design", DIRECTIONS)
+def test_every_design_keeps_the_contract(design, rows, dimension):
+    directions = DIRECTIONS[design](COUNTS.get(design, 7))
+    bank, numbers = directions.draw(rows, dimension, np.random.default_rng(0))
+    assert bank.shape[1] == dimension
+    assert numbers.shape == (rows, directions.count(dimension))
+    assert np.allclose(np.linalg.norm(bank, axis=1), 1)
+    assert numbers.min() >= 0
+    assert numbers.max() < len(bank)
+    again = directions.draw(rows, dimension, np.random.default_rng(0))
+    assert np.array_equal(bank, again[0])
+    assert np.array_equal(numbers, again[1])
+
+
+@pytest.mark.parametrize("design", DIRECTIONS)
+def test_the_mean_square_of_a_derivative_is_the_jacobians(design):
+    """E over directions of d |J u|^2 is |J|_F^2: what makes one weight fit every design."""
+    jacobian = np.random.default_rng(1).standard_normal((3, 6))
+    directions = DIRECTIONS[design](COUNTS.get(design, 12))
+    bank, numbers = directions.draw(600, 6, np.random.default_rng(0))
+    squares = 6 * ((bank[numbers] @ jacobian.T) ** 2).sum(axis=-1)
+    assert squares.mean() == pytest.approx((jacobian**2).sum(), rel=0.05)
+
+
+def test_a_state_is_never_probed_along_the_same_direction_twice():
+    _, sphere = RandomSphere(50).draw(3000, 4, np.random.default_rng(0))
+    _, frames = OrthogonalFrames(50).draw(3000, 4, np.random.default_rng(0))
+    for numbers in (sphere, frames[:, :4]):
+        assert all(len(set(row)) == len(row) for row in numbers.tolist())
+
+
+def test_a_whole_frame_is_orthonormal():
+    bank, numbers = OrthogonalFrames().draw(9, 5, np.random.default_rng(0))
+    for frame in bank[numbers]:
+        assert np.allclose(frame @ frame.T, np.eye(5), atol=1e-12)
+
+
+@pytest.mark.parametrize("stencil", [s for s in STENCILS.values() if not s.exact])
+def test_every_stencil_is_exact_on_a_line_and_of_its_order_on_a_parabola(stencil):
+    def difference(f, x, h):
+        values = [f(x + offset * h) for offset in stencil.offsets]
+        return (np.dot(stencil.weights, values) + stencil.centre * f(x)) / h
+
+    assert difference(lambda x: 3 * x + 1, 0.7, 0.5) == pytest.approx(3)
+    truncation = difference(lambda x: x**2, 0.7, 0.5) - 1.4
+    assert truncation == pytest.approx(0 if stencil is CENTRAL else 0.5)
+
+
+@pytest.mark.parametrize(
+    "spec",
+    [
+        "sphere:10",
+        "orthogonal:4,central",
+        "basis",
+        "jacobian",
+        "sphere:3,resample,radius=0.1,raw",
+        "sphere:50,per_step=all",
+        "basis,central,whitened,per_step=2",
+    ],
+)
+def test_a_spec_reads_back(spec):
+    probes = Probes.parse(spec)
+    assert Probes.parse(probes.describe()) == probes
+
+
+def test_short_specs():
+    assert Probes.parse(0) is None
+    assert Probes.parse("none") is None
+    assert Probes.parse(10) == Probes.parse("10") == Probes.parse("sphere:10")
+
+
+@pytest.mark.parametrize(
+    "spec",
+    [-1, 2.0, True, "spere:3", "sphere:0", "sphere:x", "basis:3", "sphere:3,radius=0",
+     "sphere:3,radius=nan", "sphere:3,odd", "sphere:3,per_step=0", "sphere:3,radius", ""],
+)  # fmt: skip
+def test_a_wrong_spec_is_refused_with_an_example(spec):
+    with pytest.raises(SettingError, match="next step"):
+        Probes.parse(spec)
+
+
+def test_predicted_queries():
+    assert Probes.parse("basis,central").queries(10, 7, visits=99) == 140
+    assert Probes.parse("jacobian").queries(10, 7, visits=99) == 0
+    assert Probes.parse("sphere:4,resample").queries(10, 7, visits=9) == 3 * 40

@@ -1,0 +1,101 @@
+"""Files are whole or not there, and errors keep their form."""
+
+import errno
+import os
+import pickle
+
+import numpy as np
+import pytest
+from conftest import QUICK, TOY
+
+import fdtasil
+from fdtasil import errors
+from fdtasil.demonstrations import from_npz
+from fdtasil.errors import SettingError, StorageError
+from fdtasil.seeding import episode_seeds, generator, torch_generator
+from fdtasil.storage import verify, write_bytes, write_folder
+
+KINDS = [
+    kind
+    for kind in vars(errors).values()
+    if isinstance(kind, type) and issubclass(kind, errors.FdtasilError)
+]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_every_error_says_three_things_and_survives_pickling(kind):
+    error = kind("found this", "expected that", "do so")
+    assert str(error).splitlines() == [
+        "found this",
+        "  expected: expected that",
+        "  next step: do so",
+    ]
+    again = pickle.loads(pickle.dumps(error))
+    assert str(again) == str(error)
+    assert again.found == "found this"
+
+
+def test_a_folder_reads_back(tmp_path):
+    files = {"a.txt": b"a", "deep/b.bin": bytes(range(256))}
+    write_folder(tmp_path / "run", files)
+    assert verify(tmp_path / "run") == files
+
+
+@pytest.mark.parametrize("call", ["fsync", "replace"])
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EACCES, errno.EROFS, errno.EIO])
+def test_a_failed_write_leaves_the_old_file_whole(call, code, tmp_path, monkeypatch):
+    path = tmp_path / "file"
+    write_bytes(path, b"old")
+
+    def fail(*arguments, **named):
+        raise OSError(code, os.strerror(code))
+
+    target = {"fsync": "os.fsync", "replace": "pathlib.Path.replace"}[call]
+    monkeypatch.setattr(target, fail)
+    with pytest.raises(StorageError, match="can't write"):
+        write_bytes(path, b"new")
+    monkeypatch.undo()
+    assert path.read_bytes() == b"old"
+    assert [p.name for p in tmp_path.iterdir()] == ["file"]
+
+
+def test_a_missing_or_changed_file_is_named(tmp_path):
+    with pytest.raises(StorageError, match=r"manifest\.json"):
+        verify(tmp_path)
+    write_folder(tmp_path, {"a": b"1", "b": b"2"})
+    (tmp_path / "b").write_bytes(b"3")
+    with pytest.raises(StorageError, match="b changed after writing"):
+        verify(tmp_path)
+    (tmp_path / "b").unlink()
+    with pytest.raises(StorageError, match="No such file"):
+        verify(tmp_path)
+
+
+@pytest.mark.parametrize("data", [b"", b"nonsense", b"PK\x03\x04"])
+def test_other_bytes_are_no_demonstrations(data):
+    with pytest.raises(StorageError, match="not demonstrations"):
+        from_npz(data)
+
+
+def test_streams_are_found_by_name():
+    assert generator(0, "a", 1).random() == generator(0, "a", 1).random()
+    values = [
+        generator(seed, *path).random() for seed in (0, 1) for path in (("a",), ("b",), ("a", 1))
+    ]
+    assert len(set(values)) == 6
+    assert torch_generator(0, "a").initial_seed() != torch_generator(0, "b").initial_seed()
+    assert episode_seeds(0, "e", 2, 3) == episode_seeds(0, "e", 0, 9)[2:5]
+    assert all(type(seed) is int for seed in episode_seeds(0, "e", 0, 3))
+
+
+@pytest.mark.parametrize("seed", [-1, 2**32, 1.0, True, None, "0"])
+def test_a_wrong_seed_is_refused(seed):
+    with pytest.raises(SettingError, match="seed="):
+        generator(seed, "a")
+
+
+def test_a_numpy_integer_is_a_seed(linear):
+    first = fdtasil.distill(linear, TOY, 1, **QUICK, seed=np.int64(3))
+    assert type(first.settings["seed"]) is int
+    second = fdtasil.distill(linear, TOY, 1, **QUICK, seed=3)
+    assert first.student.to_bytes() == second.student.to_bytes()

@@ -1,0 +1,124 @@
+"""The student: bounds and normaliser inside, its files, its ONNX."""
+
+import numpy as np
+import onnx
+import onnxruntime
+import pytest
+import torch
+
+from fdtasil.errors import ExportError, SettingError, StorageError
+from fdtasil.onnx_files import export_module
+from fdtasil.seeding import torch_generator
+from fdtasil.student import ACTIVATIONS, Student, StudentShape
+
+
+def make(hidden=(16, 8), activation="gelu", low=(-2.0, -1.0), high=(2.0, 3.0), seed=0):
+    mean, scale = np.array([5.0, 0, 0]), np.array([2.0, 1, 1])
+    shape = StudentShape(3, 2, hidden, activation)
+    return Student(shape, mean, scale, np.array(low), np.array(high), torch_generator(seed))
+
+
+@pytest.fixture
+def rows():
+    return 30 * np.random.default_rng(0).standard_normal((50, 3)).astype(np.float32)
+
+
+@pytest.mark.parametrize("activation", ACTIVATIONS)
+@pytest.mark.parametrize("hidden", [(), (4,), (16, 8)])
+def test_every_shape_stays_inside_its_bounds_and_exports(hidden, activation, rows):
+    student = make(hidden, activation)
+    actions = student.act(rows)
+    assert actions.shape == (50, 2)
+    assert (actions >= [-2, -1]).all()
+    assert (actions <= [2, 3]).all()
+    assert np.ptp(actions, axis=0).min() > 1
+    model = onnx.load_model_from_string(export_module(student, rows, {"a": "b"}))
+    assert {p.key: p.value for p in model.metadata_props} == {"a": "b"}
+    session = onnxruntime.InferenceSession(model.SerializeToString())
+    for count in (1, 2, 50):
+        (answers,) = session.run(["actions"], {"obs": rows[:count]})
+        assert np.abs(answers - actions[:count]).max() <= 1e-5
+
+
+def test_unbounded_actions_are_linear(rows):
+    student = make(low=(-np.inf, -1.0), high=(np.inf, 1.0))
+    actions = student.act(rows)
+    assert np.abs(actions[:, 0]).max() > 3
+    assert np.abs(actions[:, 1]).max() <= 1
+
+
+def test_the_normaliser_is_inside(rows):
+    inside = make()
+    outside = make()
+    outside.mean.zero_()
+    outside.scale.fill_(1)
+    normalised = (rows - np.array([5, 0, 0])) / np.array([2, 1, 1])
+    assert np.allclose(inside.act(rows), outside.act(normalised), atol=1e-5)
+
+
+def test_predict_takes_one_observation_or_many(rows):
+    student = make()
+    many, state = student.predict(rows)
+    one, _ = student.predict(rows[3])
+    assert state is None
+    assert one.shape == (2,)
+    assert np.allclose(one, many[3], atol=1e-6)
+    with pytest.raises(SettingError, match=r"shape \(4,\)"):
+        student.predict(np.zeros(4))
+
+
+def test_stable_baselines3_evaluates_it():
+    from stable_baselines3.common.env_util import make_vec_env
+    from stable_baselines3.common.evaluation import evaluate_policy
+
+    shape = StudentShape(3, 1, (8,), "tanh")
+    pendulum = np.array([2.0])
+    student = Student(shape, np.zeros(3), np.ones(3), -pendulum, pendulum, torch_generator(0))
+    environment = make_vec_env("Pendulum-v1", 2, seed=0)
+    mean, deviation = evaluate_policy(student, environment, n_eval_episodes=2, warn=False)
+    assert np.isfinite(mean)
+    assert np.isfinite(deviation)
+
+
+@pytest.fixture(autouse=True)
+def untouched_global_randomness():
+    """stable-baselines3 seeds the global generators."""
+
+
+def test_equal_seeds_give_equal_bytes_and_they_read_back(rows):
+    first, second, other = make(seed=1), make(seed=1), make(seed=2)
+    assert first.to_bytes() == second.to_bytes()
+    assert first.to_bytes() != other.to_bytes()
+    again = Student.from_bytes(first.to_bytes({"note": "kept"}))
+    assert again.shape == first.shape
+    assert np.array_equal(again.act(rows), first.act(rows))
+
+
+@pytest.mark.parametrize("data", [b"", b"nonsense", make().to_bytes()[:-9]])
+def test_other_bytes_are_no_student(data):
+    with pytest.raises(StorageError, match="not a student's weights"):
+        Student.from_bytes(data)
+
+
+def test_nan_weights_are_not_exported(rows):
+    student = make()
+    with torch.no_grad():
+        next(student.parameters())[0, 0] = torch.nan
+    with pytest.raises(ExportError, match="differ by nan"):
+        export_module(student, rows, {})
+
+
+def test_a_module_that_onnx_can_not_hold_is_named(rows):
+    class Branches(torch.nn.Module):
+        def forward(self, x):
+            """Depends on a value, which a graph can't."""
+            return x if float(x.sum()) > 0 else -x
+
+    with pytest.raises(ExportError, match="can't export Branches"):
+        export_module(Branches(), rows, {})
+
+
+@pytest.mark.parametrize("wrong", [{"activation": "step"}, {"hidden": (0,)}, {"hidden": (2.5,)}])
+def test_a_wrong_shape_is_refused(wrong):
+    with pytest.raises(SettingError):
+        make(**wrong)
