@@ -1,11 +1,10 @@
 """Distil a black-box controller into a small torch policy that reacts as it does.
 
->>> import fdtasil
-    import fdtasil
+import fdtasil
 
-    result = fdtasil.distill("experts/HalfCheetah-v5.onnx", "HalfCheetah-v5", probes=10)
-    print(result.evaluation)
-    result.to_onnx("student.onnx")
+result = fdtasil.distill("experts/HalfCheetah-v5.onnx", "HalfCheetah-v5", probes=10)
+print(result.evaluation)
+result.to_onnx("student.onnx")
 """
 
 from fdtasil.distilled import Distilled

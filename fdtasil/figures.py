@@ -21,12 +21,15 @@ def draw_training(history: Sequence[dict[str, float]]) -> bytes:
     panels = figure.subplots(1, 2 if with_probes else 1, squeeze=False)[0]
     steps = _cumulative_steps(history)
     names = ("action_error", "derivative_error")
-    titles = ("action error (norm)", "derivative error (norm of the whitened Jacobian's)")
+    titles = ("error of the actions", "error of the whitened Jacobian")
     for panel, name, title in zip(panels, names, titles, strict=False):
         panel.plot(steps, [entry[name] for entry in history], color=_STUDENT, linewidth=1.4)
         panel.set_yscale("log")
+        for axis_formatter in (panel.yaxis.set_major_formatter, panel.yaxis.set_minor_formatter):
+            axis_formatter("{x:.2g}")
         panel.set_title(title, fontsize=9)
         panel.set_xlabel("training step")
+        panel.set_ylabel("mean norm")
         panel.grid(alpha=0.3, which="both", linewidth=0.5)
     return _png(figure)
 
@@ -50,6 +53,7 @@ def draw_returns(evaluation: Evaluation) -> bytes:
         f"survival {evaluation.survival:.2f}",
         fontsize=9,
     )
+    panel.xaxis.get_major_locator().set_params(integer=True)
     panel.set_xlabel("evaluation episode, in the order of the expert's return")
     panel.set_ylabel(f"return over {evaluation.horizon} steps")
     panel.set_ylim(bottom=min(0.0, *expert, *student))

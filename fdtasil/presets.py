@@ -52,7 +52,7 @@ class Preset:
 
 PRESETS = {
     "standard": Preset(
-        radius=0.2,
+        radius=0.3,
         space="whitened",
         per_step=1,
         hidden=(512, 512),

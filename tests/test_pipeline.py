@@ -41,7 +41,8 @@ def test_every_source_gives_a_student_at_the_predicted_cost(spec, tmp_path):
 
 
 def test_the_student_becomes_the_expert(linear):
-    result = fdtasil.distill(linear, TOY, 4, **{**QUICK, "steps": 500, "hidden": (32,)})
+    longer = {"steps": 800, "hidden": (64,), "episodes": 6}
+    result = fdtasil.distill(linear, TOY, 4, **{**QUICK, **longer})
     assert result.evaluation.normalized_return == pytest.approx(1, abs=0.02)
     assert result.evaluation.action_error < 0.05
     assert result.evaluation.survival == 1

@@ -137,10 +137,11 @@ class _Probe:
 
     def fills_bounds(self) -> Finding:
         """Warn of an actor in [-1, 1] whose actions were to be scaled to wider bounds."""
-        largest = float(np.abs(self.answers).max())
+        sizes = np.abs(self.answers)
+        largest, saturated = float(sizes.max()), float((sizes > 0.99).mean())
         wider = float(min(-self.boxes.low.max(), self.boxes.high.min()))
         measured = f"largest action {largest:.3g}, bounds {_numbers(self.boxes.high)}"
-        if 1.5 <= wider < np.inf and 0.95 < largest <= 1.0 + 1e-6:
+        if 1.5 <= wider < np.inf and largest <= 1.0 + 1e-6 and saturated > 0.1:
             warnings.warn(
                 f"all actions of {self.expert.name} lie in [-1, 1], the bounds are +-{wider:.3g}: "
                 "is the action scale missing from the export?",

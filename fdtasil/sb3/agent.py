@@ -77,10 +77,10 @@ def read_agent(
         ExpertError: If the zip is damaged, is not such an agent, or can't be read without trust.
         SettingError: If an argument has a value that can't be used.
 
-    Example:
-        >>> agent = read_agent("agents/HalfCheetah-v5.zip")           # doctest: +SKIP
-        >>> agent.algorithm, agent.observation_size                   # doctest: +SKIP
-        ('SAC', 17)
+    Example::
+
+        agent = read_agent("agents/HalfCheetah-v5.zip")
+        actions = agent.module(torch.from_numpy(observations))
     """
     if trust not in (None, "pickle"):
         raise SettingError(f"trust={trust!r}", '"pickle" or None', 'write trust="pickle"')

@@ -42,7 +42,7 @@ class Archive:
         return sha256(self.content)
 
     def library_version(self) -> str:
-        """Return the version of stable-baselines3 that wrote the zip, or "unknown" before 1.0."""
+        """Return the version of stable-baselines3 that wrote the zip; "unknown" before 0.9."""
         try:
             text = _member(self.path, self.content, "_stable_baselines3_version").decode().strip()
         except (ExpertError, UnicodeDecodeError):
@@ -132,7 +132,7 @@ def _member(path: Path, content: bytes, name: str) -> bytes:
                 raise ExpertError(
                     f"{path} has {len(found)} members named {name}",
                     "a zip written by save() of stable-baselines3, with one",
-                    "check that this is the right file",
+                    "check that this is the right file, copied whole",
                 )
             _check_size(path, name, found[0].file_size)
             return archive.read(found[0])

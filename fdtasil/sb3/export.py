@@ -54,9 +54,9 @@ def export_sb3(
         ExportError: If it can't be exported, or the file and the agent differ by more than 1e-5.
         StorageError: If the file can't be written.
 
-    Example:
-        >>> export_sb3("agent.zip", "agent.onnx", env="HalfCheetah-v5")  # doctest: +SKIP
-        PosixPath('agent.onnx')
+    Example::
+
+        export_sb3("agents/HalfCheetah-v5.zip", "agent.onnx", env="HalfCheetah-v5")
     """
     agent = read_agent(
         agent_zip,

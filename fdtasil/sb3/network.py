@@ -163,8 +163,8 @@ def _is_plain(*tensors: Tensor) -> bool:
 
 
 def _linear(weight: Tensor, bias: Tensor) -> nn.Linear:
-    layer = nn.utils.skip_init(nn.Linear, weight.shape[1], weight.shape[0])
-    with torch.no_grad():
-        layer.weight.copy_(weight)
-        layer.bias.copy_(bias)
+    # On "meta" nothing is drawn from torch's global generator, whose state is the caller's.
+    layer = nn.Linear(weight.shape[1], weight.shape[0], device="meta")
+    layer.weight = nn.Parameter(weight.detach().float().clone())
+    layer.bias = nn.Parameter(bias.detach().float().clone())
     return layer

@@ -109,11 +109,11 @@ _HARMLESS = {
     *("n_quantiles", "net_arch", "normalize_images", "optimizer_class", "optimizer_kwargs"),
     *("ortho_init", "sde_net_arch", "share_features_extractor", "use_expln"),
 }
-# Policies whose observations fdtasil has no place for, by a part of their class name.
+# The library's own policies that fdtasil has no place for, trusted or not.
 _UNFIT = {
-    "Cnn": "a policy on images",
-    "MultiInput": "a policy on dictionaries of observations",
-    "recurrent": "a policy with memory",
+    r"(stable_baselines3|sb3_contrib)\..*Cnn": "a policy on images",
+    r"(stable_baselines3|sb3_contrib)\..*MultiInput": "a policy on dictionaries of observations",
+    r"sb3_contrib\..*recurrent": "a policy with memory",
 }
 
 
@@ -121,17 +121,24 @@ def find_recipe(record: Record, source: str) -> Recipe:
     """Return the recipe of the algorithm that wrote the record.
 
     Raises:
-        ExpertError: If it is none of those known.
+        ExpertError: If it is none of those known, or its policy needs more than flat observations.
     """
+    policy = _policy_class(record)
+    for pattern, reason in _UNFIT.items():
+        if re.match(pattern, policy):
+            raise ExpertError(
+                f"{source} holds {reason} ({policy})",
+                "a policy on flat observations, without memory",
+                "choose or train such an agent; fdtasil distils no other",
+            )
     for recipe in RECIPES:
         if all(
             key in record and value in (None, record[key]) for key, value in recipe.marks.items()
         ):
             return recipe
-    known = ", ".join(sorted(recipe.algorithm for recipe in RECIPES))
     raise ExpertError(
-        f"{source} holds no agent of a known algorithm",
-        f"one of {known}",
+        f"{source} holds no agent of a known algorithm (its policy: {policy})",
+        f"one of {', '.join(sorted(recipe.algorithm for recipe in RECIPES))}",
         "load it yourself and pass a function: lambda observations: agent.predict(...)[0]",
     )
 
@@ -142,7 +149,10 @@ def read_activation(record: Record, recipe: Recipe, source: str) -> type[nn.Modu
     Raises:
         ExpertError: If it is another policy, with the reason.
     """
-    _check_class(record, recipe, source)
+    policy = _policy_class(record)
+    if policy not in recipe.policies:
+        expected = " or ".join(sorted(recipe.policies))
+        raise _cannot(source, f"has the policy class {policy}", expected)
     settings = record.get("policy_kwargs") or {}
     if not isinstance(settings, dict):
         raise ExpertError(
@@ -171,23 +181,13 @@ def read_activation(record: Record, recipe: Recipe, source: str) -> type[nn.Modu
     return recipe.activation if activation is None else _ACTIVATIONS[activation]
 
 
-def _check_class(record: Record, recipe: Recipe, source: str) -> None:
+def _policy_class(record: Record) -> str:
     entry = record.get("policy_class")
     entry = entry if isinstance(entry, dict) else {}
     # A class is recorded by its dictionary, which has its module but not its name: only the
     # names of its functions tell.
     function = re.match(r"<function (\w+)\.__init__ at ", str(entry.get("__init__")))
-    name = f"{entry.get('__module__')}.{function[1] if function else '?'}"
-    if name in recipe.policies:
-        return
-    for part, reason in _UNFIT.items():
-        if part in name:
-            raise ExpertError(
-                f"{source} holds {reason} ({name})",
-                "a policy on flat observations, without memory",
-                "train or export one; trust does not help here",
-            )
-    raise _cannot(source, f"has the policy class {name}", " or ".join(sorted(recipe.policies)))
+    return f"{entry.get('__module__')}.{function[1] if function else '?'}"
 
 
 def _cannot(source: str, found: str, expected: str) -> ExpertError:

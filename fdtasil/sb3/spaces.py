@@ -35,18 +35,16 @@ def read_size(record: Mapping[str, Any], name: str, source: str) -> int:
     """
     entry = record.get(name)
     entry = entry if isinstance(entry, dict) else {}
+    kind, dtype = str(entry.get(":type:")), str(entry.get("dtype"))
     shape = entry.get("_shape", entry.get("shape"))  # gym called it shape until 0.19
-    kind = str(entry.get(":type:"))
-    flat = isinstance(shape, list) and len(shape) == 1 and isinstance(shape[0], int)
-    continuous = name != "action_space" or "float" in str(entry.get("dtype"))
-    if not _BOX.fullmatch(kind) or not flat or not continuous:
-        raise ExpertError(
-            f"{source} has an {name.replace('_', ' ')} of {kind}, shape {shape}, "
-            f"dtype {entry.get('dtype')}",
-            "a Box of floats with one dimension",
-            _ADVICE[name],
-        )
-    return shape[0]
+    if _BOX.fullmatch(kind) and (name != "action_space" or "float" in dtype):
+        if isinstance(shape, list) and len(shape) == 1 and isinstance(shape[0], int):
+            return shape[0]
+    raise ExpertError(
+        f"{source} has the {name} {kind} of shape {shape} and dtype {dtype}",
+        "a Box of floats with one dimension",
+        _ADVICE[name],
+    )
 
 
 def read_bounds(record: Mapping[str, Any], size: int, source: str) -> Bounds:

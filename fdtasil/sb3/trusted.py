@@ -3,7 +3,10 @@
 import importlib
 import io
 import pickle
+import random
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -92,7 +95,7 @@ def unpickle_statistics(path: Path, data: bytes) -> Statistics | None:
         raise ExpertError(
             f"{path} can't be used: {first_line(error)}",
             "what VecNormalize.save() wrote, for flat observations",
-            "save it again with a current stable-baselines3",
+            "install what it names, or save it again with a current stable-baselines3",
         ) from error
 
 
@@ -101,7 +104,7 @@ def _load(algorithm: Any, archive: Archive) -> "BaseAlgorithm":
     # need them.
     unneeded = {"learning_rate": 0.0, "lr_schedule": _zero, "clip_range": _zero}
     try:
-        with warnings.catch_warnings():
+        with _randomness_kept(), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             return algorithm.load(
                 io.BytesIO(archive.content), device="cpu", custom_objects=unneeded
@@ -112,6 +115,18 @@ def _load(algorithm: Any, archive: Archive) -> "BaseAlgorithm":
             "a zip that the installed version can load",
             "install what it names, or save it again with the version that wrote it",
         ) from error
+
+
+@contextmanager
+def _randomness_kept() -> Iterator[None]:
+    """Undo the seeding of all global generators that loading an agent does."""
+    plain, numbers = random.getstate(), np.random.get_state()
+    try:
+        with torch.random.fork_rng(devices=[]):
+            yield
+    finally:
+        random.setstate(plain)
+        np.random.set_state(numbers)
 
 
 def _zero(_: float) -> float:
