@@ -17,12 +17,14 @@ from fdtasil.experts import load_expert
 from fdtasil.experts.gate import examine_expert
 from fdtasil.pipeline import distill, evaluate
 from fdtasil.rollouts import follow, rollout
+from fdtasil.sb3 import export_sb3
 from fdtasil.seeding import episode_seeds
 
 __all__ = ["main"]
 
 ExpertPath = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="EXPERT")]
 PolicyPath = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="POLICY")]
+AgentPath = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="AGENT.zip")]
 EnvironmentId = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ENV")]
 
 
@@ -79,6 +81,10 @@ def _distill(out: Path, compare: bool, **arguments: Any) -> None:
     asked = ", ".join(f"{name} {rows:,}" for name, rows in result.queries.items() if rows)
     print(f"rows asked of the expert: {asked}")
     print(f"saved in {out}: student.onnx, student.safetensors, report.json, figures/, ...")
+
+
+def _export_sb3(**arguments: Any) -> None:
+    print(f"written: {export_sb3(**arguments)}")
 
 
 def _evaluate(**arguments: Any) -> None:
@@ -144,6 +150,9 @@ def as_command(
     return command
 
 
+_METAVARS: dict[Any, str] = {tuple: "INT [INT ...]", int: "INT", float: "FLOAT"}
+
+
 def _shell_parameter(
     parameter: inspect.Parameter, shell_types: dict[str, Any]
 ) -> inspect.Parameter:
@@ -152,7 +161,7 @@ def _shell_parameter(
     if get_origin(kind) in (Union, UnionType) and NoneType in get_args(kind):
         # tyro would show "{None}|INT"; leaving the argument out is how a shell says None.
         (inner,) = (one for one in get_args(kind) if one is not NoneType)
-        metavar = "INT [INT ...]" if get_origin(inner) is tuple else inner.__name__.upper()
+        metavar = _METAVARS.get(get_origin(inner) or inner, "TEXT")
         kind = Annotated[kind, tyro.conf.arg(metavar=metavar)]
     return parameter.replace(annotation=kind, default=default, kind=inspect.Parameter.KEYWORD_ONLY)
 
@@ -167,6 +176,19 @@ COMMANDS: dict[str, Callable[..., None]] = {
             "out": (Path, Path("runs/latest"), "Folder that the run is saved in."),
             "compare": (bool, False, "Also clone plainly, without probes, and show both."),
         },
+    ),
+    "export-sb3": as_command(
+        export_sb3,
+        _export_sb3,
+        {
+            "agent_zip": AgentPath,
+            "out": Path,
+            "env": str | None,
+            "vecnormalize": str | None,
+            "action_low": float | None,
+            "action_high": float | None,
+        },
+        {},
     ),
     "evaluate": as_command(
         evaluate, _evaluate, {"policy": PolicyPath, "env": EnvironmentId, "expert": str}, {}

@@ -36,6 +36,8 @@ def draw_training(history: Sequence[dict[str, float]]) -> bytes:
 
 def draw_returns(evaluation: Evaluation) -> bytes:
     """Draw each episode's return of the student against the expert's, as a PNG."""
+    from matplotlib.ticker import MaxNLocator
+
     figure = _figure(7.0, 3.2)
     panel = figure.subplots()
     order = sorted(range(evaluation.episodes), key=lambda e: evaluation.expert_returns[e])
@@ -53,7 +55,7 @@ def draw_returns(evaluation: Evaluation) -> bytes:
         f"survival {evaluation.survival:.2f}",
         fontsize=9,
     )
-    panel.xaxis.get_major_locator().set_params(integer=True)
+    panel.xaxis.set_major_locator(MaxNLocator(integer=True))
     panel.set_xlabel("evaluation episode, in the order of the expert's return")
     panel.set_ylabel(f"return over {evaluation.horizon} steps")
     panel.set_ylim(bottom=min(0.0, *expert, *student))

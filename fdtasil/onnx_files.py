@@ -31,7 +31,7 @@ _IMPOSTORS = {
     b"\x80": ("a Python pickle", "export the controller to ONNX; pickles are never opened"),
     b"PK\x03\x04": (
         "a zip; if stable-baselines3 wrote it, it is an agent and not a model",
-        "export the agent to ONNX first",
+        "name it *.zip, or export it with `fdtasil export-sb3`",
     ),
 }
 

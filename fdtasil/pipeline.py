@@ -17,6 +17,7 @@ from fdtasil.progress import Stages
 from fdtasil.report import noted_warnings, report_of
 from fdtasil.rollouts import Episodes, Policy, first_observations, follow, rollout
 from fdtasil.rounds import Rounds
+from fdtasil.sb3 import Trust
 from fdtasil.seeding import check_seed, episode_seeds
 from fdtasil.student import StudentShape
 from fdtasil.trainers import Trainer, trainer_of
@@ -36,6 +37,7 @@ def distill(
     device: str = "cpu",
     preset: str = "standard",
     output: str | None = None,
+    trust: Trust = None,
     hidden: tuple[int, ...] | None = None,
     activation: str | None = None,
     steps: int | None = None,
@@ -56,8 +58,9 @@ def distill(
     differences). The expert is never differentiated, unless `probes="jacobian"`.
 
     Args:
-        expert: An ONNX path, a torch module, an object with stable-baselines3's `predict`, or a
-            function on batches (B, n) -> (B, m) in environment units.
+        expert: An ONNX path, the path of a stable-baselines3 zip, a torch module, an object with
+            stable-baselines3's `predict`, or a function on batches (B, n) -> (B, m) in
+            environment units.
         env: A gymnasium id (`module:Id` too), a gymnasium environment, or a function making one.
         probes: The derivative source: 0 (plain behaviour cloning), N or "sphere:N" (N random
             directions for each state, asked once), "sphere:N,resample" (asked anew while
@@ -71,6 +74,8 @@ def distill(
         preset: Where the defaults below come from: "standard", or "paper" (TaSIL's settings: raw
             probes of radius 0.01, weight 0.01, 4,500 epochs).
         output: Name of the ONNX output with the actions, where several could be it.
+        trust: "pickle" lets stable-baselines3 load what can't be read from a zip without running
+            code that is in it.
         hidden: Widths of the student's hidden layers.
         activation: One of elu, gelu, relu, silu, tanh.
         steps: Gradient steps; leave out where `epochs` is given.
@@ -114,7 +119,7 @@ def distill(
     )
     with EnvironmentPool(env) as pool, torch_settings() as precision, noted_warnings() as notes:
         n, m = pool.boxes.observation_size, pool.boxes.action_size
-        black_box = load_expert(expert, n, m, output=output)
+        black_box = load_expert(expert, n, m, output=output, trust=trust)
         run = Configuration(
             expert=str(expert) if isinstance(expert, (str, Path)) else black_box.name,
             expert_sha256=black_box.sha256,

@@ -6,7 +6,9 @@ import os
 import subprocess
 import sys
 
+import numpy as np
 import pytest
+import torch
 from conftest import TOY, mlp_onnx
 
 import fdtasil
@@ -41,6 +43,22 @@ def test_the_shell_has_the_functions_arguments_and_defaults(name):
     for argument in set(function) & set(command):
         default = function[argument].default
         assert command[argument].default in (default, str(default))
+
+
+def test_a_stable_baselines3_agent_becomes_an_expert(tmp_path):
+    from stable_baselines3 import SAC
+
+    state = torch.get_rng_state(), np.random.get_state()
+    SAC("MlpPolicy", "Pendulum-v1", policy_kwargs={"net_arch": [8]}).save(tmp_path / "agent.zip")
+    torch.set_rng_state(state[0])
+    np.random.set_state(state[1])
+    exported = ["export-sb3", "agent.zip", "--env", "Pendulum-v1", "--out", "agent.onnx"]
+    done = shell(*exported, cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    for expert in ("agent.zip", "agent.onnx"):
+        shown = shell("inspect", expert, "Pendulum-v1", "--episodes", 1, cwd=tmp_path)
+        assert shown.returncode == 0, shown.stderr
+        assert "a torch twin agrees with it" in shown.stdout
 
 
 def test_inspect_distill_evaluate(tmp_path):

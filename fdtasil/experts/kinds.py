@@ -12,6 +12,7 @@ import torch
 from fdtasil.errors import ExpertError
 from fdtasil.experts.expert import Expert
 from fdtasil.experts.onnx_expert import open_onnx
+from fdtasil.sb3 import Trust, read_agent
 
 __all__ = ["ExpertLike", "load_expert"]
 
@@ -36,16 +37,20 @@ def load_expert(
     *,
     output: str | None = None,
     batch: int | None = None,
+    trust: Trust = None,
 ) -> Expert:
     """Open whatever answers observations with actions.
 
     Args:
-        source: An ONNX path, a torch module, an object with stable-baselines3's `predict`, a
-            function (B, n) -> (B, m), or an `Expert`, of which a copy is returned.
+        source: An ONNX path, the path of a stable-baselines3 zip, a torch module, an object with
+            stable-baselines3's `predict`, a function (B, n) -> (B, m), or an `Expert`, of which a
+            copy is returned.
         observation_size: n, where it is known; checked against the expert.
         action_size: m, where it is known; chooses among the outputs of an ONNX file.
         output: Name of the ONNX output that holds the actions.
         batch: Rows asked at once, where the expert can't take any number; 1 asks row by row.
+        trust: "pickle" lets stable-baselines3 load what can't be read from a zip without running
+            code that is in it.
 
     Returns:
         The expert, with an empty ledger.
@@ -64,6 +69,8 @@ def load_expert(
             action_size=source.action_size or action_size,
             queries=Counter(),
         )
+    elif isinstance(source, (str, Path)) and Path(source).suffix == ".zip":
+        expert = _from_agent(Path(source), trust)
     elif isinstance(source, (str, Path)):
         expert = open_onnx(Path(source), observation_size, action_size, output)
     elif isinstance(source, torch.nn.Module):
@@ -79,6 +86,14 @@ def load_expert(
             "wrap it: lambda observations: ...  ((B, n) -> (B, m))",
         )
     return expert if batch is None else _limited(expert, batch)
+
+
+def _from_agent(path: Path, trust: Trust) -> Expert:
+    agent = read_agent(path, trust=trust)
+    expert = _from_module(agent.module, len(agent.action_low))
+    return dataclasses.replace(
+        expert, name=path.name, observation_size=agent.observation_size, sha256=agent.sha256
+    )
 
 
 def _from_module(module: torch.nn.Module, action_size: int | None) -> Expert:

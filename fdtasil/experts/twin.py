@@ -142,6 +142,8 @@ OPERATORS: dict[str, Operator] = {
     "Identity": lambda x: x,
     "LeakyRelu": lambda x, alpha=0.01: torch.nn.functional.leaky_relu(x, alpha),
     "MatMul": torch.matmul,
+    "Max": torch.maximum,
+    "Min": torch.minimum,
     "Mul": torch.mul,
     "Neg": torch.neg,
     "Relu": torch.relu,

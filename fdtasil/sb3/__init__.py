@@ -6,7 +6,7 @@ and what has to be known besides (class names, the activation, the action bounds
 `trust="pickle"` hands the zip to stable-baselines3 instead; nothing else imports that library.
 """
 
-from fdtasil.sb3.agent import Agent, read_agent
+from fdtasil.sb3.agent import Agent, Trust, read_agent
 from fdtasil.sb3.export import export_sb3
 
-__all__ = ["Agent", "export_sb3", "read_agent"]
+__all__ = ["Agent", "Trust", "export_sb3", "read_agent"]

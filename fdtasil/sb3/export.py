@@ -37,14 +37,16 @@ def export_sb3(
     in the graph. Its metadata say where it comes from.
 
     Args:
-        agent_zip: As `read_agent`.
+        agent_zip: The zip of a SAC, TD3, DDPG, TQC, PPO, A2C or TRPO agent with an MLP policy.
         out: The file to write.
         env: The agent's environment. It is checked that it fits, and the file is compared with
             the agent on states of a short rollout; without it, on random states.
-        vecnormalize: As `read_agent`.
-        trust: As `read_agent`.
-        action_low: As `read_agent`.
-        action_high: As `read_agent`.
+        vecnormalize: The VecNormalize file that the agent was trained with; it is a pickle, and
+            needs `trust`.
+        trust: "pickle" lets stable-baselines3 load what can't be read without running code that
+            is in the files.
+        action_low: (m,) or one number, instead of the bounds that the zip has as text.
+        action_high: (m,) or one number; given together with `action_low`.
 
     Returns:
         `out`.
