@@ -5,7 +5,6 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-from scipy import stats
 
 from fdtasil.environments import EnvironmentPool
 from fdtasil.experts import Expert
@@ -151,6 +150,8 @@ def _reference_return(
 
 
 def _interval(ours: np.ndarray, theirs: np.ndarray, seed: int) -> tuple[float, float]:
+    from scipy import stats  # loads for most of a second, and many runs end before it
+
     def ratio(a: np.ndarray, b: np.ndarray, axis: int = -1) -> np.ndarray:
         return a.mean(axis=axis) / b.mean(axis=axis)
 
