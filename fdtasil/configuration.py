@@ -7,7 +7,7 @@ from fdtasil.errors import SettingError
 from fdtasil.fit import Fit
 from fdtasil.probes import Probes
 from fdtasil.student import StudentShape
-from fdtasil.trainers import Trainer
+from fdtasil.trainers import Trainer, describe_trainer
 
 __all__ = ["GATE_STATES", "Configuration", "check_count"]
 
@@ -65,8 +65,7 @@ class Configuration:
             probe = self.probes.queries(states, self.student.observation_size, visits)
         return {
             "check": 2 * GATE_STATES * _ROWS_A_STATE,
-            "act": states,
-            "label": 0,
+            **self.trainer.queries(self.episodes, self.horizon),
             "probe": probe,
             "evaluate": 2 * self.evaluation_episodes * self.horizon,
         }
@@ -96,7 +95,7 @@ class Configuration:
             if isinstance(value, (str, int, float, type(None)))
         }
         return plain | {
-            "trainer": self.trainer.name,
+            "trainer": describe_trainer(self.trainer),
             "probes": self.probes.describe() if self.probes else "none",
             "student": {**asdict(self.student), "hidden": list(self.student.hidden)},
             "fit": asdict(self.fit),

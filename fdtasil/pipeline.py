@@ -66,7 +66,8 @@ def distill(
             directions for each state, asked once), "sphere:N,resample" (asked anew while
             training), "orthogonal:N", "basis", "jacobian" (the analytic reference). Options
             after commas: forward, central, radius=R, raw, whitened, per_step=K.
-        trainer: Who acts in which round: "bc".
+        trainer: Who acts in which round: "bc" (the expert), "dagger" (a mixture of expert and
+            student), "dart" (the expert with noise), or a trainer with settings of its own.
         episodes: Number of demonstrations.
         horizon: Steps after which an episode is cut; default: the environment's time limit.
         seed: Equal seeds give equal bytes, on one machine with the same versions.
@@ -146,8 +147,7 @@ def distill(
         rounds, student, history = Rounds(black_box, pool, run.probes, seed, stages), None, []
         started = time.perf_counter()
         for round_, count in enumerate(run.trainer.rounds(episodes)):
-            behaviour = run.trainer.behaviour(round_, black_box, student)
-            rounds.collect(round_, count, behaviour, run.horizon)
+            rounds.collect(round_, count, run.trainer, student, run.horizon)
             student, entries = rounds.train(round_, run.student, run.fit, place)
             history += entries
         train_seconds = time.perf_counter() - started

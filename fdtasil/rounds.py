@@ -19,9 +19,10 @@ from fdtasil.experts import Expert
 from fdtasil.fit import Fit, fit
 from fdtasil.probes import Probes
 from fdtasil.progress import Stages
-from fdtasil.rollouts import Behaviour, rollout
+from fdtasil.rollouts import Behaviour, Episodes, rollout
 from fdtasil.seeding import episode_seeds, generator, torch_generator
 from fdtasil.student import Student, StudentShape
+from fdtasil.trainers import Situation, Trainer
 
 __all__ = ["Rounds"]
 
@@ -56,18 +57,18 @@ class Rounds:
     steps: int = 0
     counts: Counter[str] = field(default_factory=Counter)
 
-    def collect(self, round_: int, count: int, behaviour: Behaviour, horizon: int) -> None:
+    def collect(
+        self, round_: int, count: int, trainer: Trainer, student: Student | None, horizon: int
+    ) -> None:
         """Record `count` episodes, label their states and ask the probes around them."""
-        first, total = self.episodes, count * horizon
-        with self.stages.stage(f"demonstrations, round {round_}", total, "step") as move:
-            recorded = rollout(
-                behaviour,
-                self.pool,
-                episode_seeds(self.seed, "rollout", first, count),
-                horizon,
-                [generator(self.seed, "noise", e) for e in range(first, first + count)],
-                move,
-            )
+
+        def record_extra(behaviour: Behaviour, extra: int) -> Episodes:
+            return self._record(behaviour, f"extra {round_}", 0, extra, horizon)
+
+        policy = student.act if student else None
+        situation = Situation(round_, self.expert, policy, record_extra)
+        first = self.episodes
+        recorded = self._record(trainer.behaviour(situation), "rollout", first, count, horizon)
         new = label(recorded, self.expert, first, round_)
         self.episodes += count
         self.counts["clipped_actions"] += recorded.clipped_actions
@@ -78,6 +79,15 @@ class Rounds:
         if self.probes is not None:
             answers = self._ask(new.observations, self.episodes, 0)
             self.answers = self.answers + answers if self.answers else answers
+
+    def _record(
+        self, behaviour: Behaviour, stream: str, first: int, count: int, horizon: int
+    ) -> Episodes:
+        numbers = range(first, first + count)
+        noise = [generator(self.seed, f"{stream} noise", episode) for episode in numbers]
+        seeds = episode_seeds(self.seed, stream, first, count)
+        with self.stages.stage("demonstrations", count * horizon, "step") as move:
+            return rollout(behaviour, self.pool, seeds, horizon, noise, move)
 
     def train(
         self, round_: int, shape: StudentShape, settings: Fit, device: torch.device
