@@ -101,9 +101,25 @@ def _exact_errors(
     """Return the errors (B, m) at the states and (B, k, m) of the exact derivatives."""
     count = displacements.shape[1]
     states = batch.observations.repeat_interleave(count, dim=0)
-    answers, slopes, *_ = torch.func.jvp(student, (states,), (displacements.flatten(0, 1),))
+    answers, slopes = _derivative_along(student, states, displacements.flatten(0, 1))
     action_error = answers[::count] - batch.actions
     return action_error, slopes.reshape(values[:, :, 0].shape) - values[:, :, 0]
+
+
+def _derivative_along(
+    student: nn.Module, states: Tensor, directions: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return f(x) and J u, each (B, m), differentiable.
+
+    Reverse mode twice: v'J is linear in v, and its derivative there is J. Forward mode takes half
+    as long again, for its formulas of the activations are decomposed into many small operations.
+    """
+    states = states.detach().requires_grad_()
+    answers = student(states)
+    dummy = torch.zeros_like(answers, requires_grad=True)
+    (pulled,) = torch.autograd.grad(answers, states, dummy, create_graph=True)
+    (slopes,) = torch.autograd.grad(pulled, dummy, directions, create_graph=True)
+    return answers, slopes
 
 
 def _mean_norm(errors: Tensor) -> Tensor:
