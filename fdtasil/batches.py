@@ -20,7 +20,7 @@ class Batches:
         demonstrations: N labelled states.
         probes: The derivative source; None for plain behaviour cloning.
         answers: Number of the pool -> the expert's answers; None without probes.
-        random: Draws the order.
+        random: Name of a stream -> its generator; an epoch's order depends on its number only.
         device: Where the data and the minibatches are.
 
     Attributes:
@@ -32,7 +32,7 @@ class Batches:
         demonstrations: Demonstrations,
         probes: Probes | None,
         answers: Callable[[int], Answers] | None,
-        random: torch.Generator,
+        random: Callable[[str], torch.Generator],
         device: torch.device,
     ) -> None:
         self._observations = torch.from_numpy(demonstrations.observations).to(device)
@@ -41,17 +41,20 @@ class Batches:
         self.gain = 1.0
         self._pool: _Pool | None = None
         if probes is not None and answers is not None:
-            self._pool = _Pool(probes, answers, len(demonstrations), random, device)
+            self._pool = _Pool(probes, answers, len(demonstrations), random("offset"), device)
 
-    def epoch(self, number: int, batches: int) -> Iterator[Minibatch]:
-        """Deal out each state once, in `batches` minibatches of (almost) equal size."""
-        order = torch.randperm(len(self._observations), generator=self._random)
+    def epoch(self, number: int, rows: Tensor, batches: int) -> Iterator[Minibatch]:
+        """Deal out each of `rows` once, in `batches` minibatches of (almost) equal size."""
+        order = torch.randperm(len(rows), generator=self._random(f"epoch {number}"))
         if self._pool is not None:
             self.gain = self._pool.load(number)
-        for rows in order.to(self._device).tensor_split(batches):
-            observations, actions = self._observations[rows], self._actions[rows]
-            around = self._pool.deal(rows, number) if self._pool is not None else (None, None)
-            yield Minibatch(observations, actions, *around)
+        for part in rows[order].to(self._device).tensor_split(batches):
+            yield self.visit(part, number)
+
+    def visit(self, rows: Tensor, number: int) -> Minibatch:
+        """Return the minibatch of some states at their visit of that number."""
+        around = self._pool.deal(rows, number) if self._pool is not None else (None, None)
+        return Minibatch(self._observations[rows], self._actions[rows], *around)
 
 
 class _Pool:

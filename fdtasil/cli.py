@@ -1,6 +1,7 @@
 """The same functions from a shell; every default and help text is read from them."""
 
 import inspect
+import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -19,9 +20,15 @@ from fdtasil.pipeline import distill, evaluate
 from fdtasil.rollouts import follow, rollout
 from fdtasil.sb3 import export_sb3
 from fdtasil.seeding import episode_seeds
+from fdtasil.storage import to_json, write_bytes
 
-__all__ = ["main"]
+__all__ = ["COMMANDS", "main"]
 
+COMMAND = "command.json"
+"""File of a run's folder with the arguments that `fdtasil distill` was called with."""
+
+OptionalExpert = Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="EXPERT")]
+OptionalEnvironment = Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="ENV")]
 ExpertPath = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="EXPERT")]
 PolicyPath = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="POLICY")]
 AgentPath = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="AGENT.zip")]
@@ -74,13 +81,44 @@ def inspect_expert(
         raise problem
 
 
-def _distill(out: Path, compare: bool, **arguments: Any) -> None:
-    result = distill(**arguments)
-    result.save(out)
-    print(_side_by_side(result, distill(**{**arguments, "probes": 0}) if compare else None))
+def _distill(compare: bool, **arguments: Any) -> None:
+    resume = arguments["resume"]
+    if resume is not None and arguments["expert"] is None and arguments["env"] is None:
+        arguments = {**_remembered(resume), "resume": resume}
+    elif not (arguments["out"] / "checkpoints").exists():
+        plain = {k: str(v) if isinstance(v, Path) else v for k, v in arguments.items()}
+        write_bytes(arguments["out"] / COMMAND, to_json(plain))
+    result, out = distill(**arguments), resume or arguments["out"]
+    plainly = {**arguments, "probes": 0, "out": None, "resume": None, "log_formats": ()}
+    print(_side_by_side(result, distill(**plainly) if compare else None))
     asked = ", ".join(f"{name} {rows:,}" for name, rows in result.queries.items() if rows)
     print(f"rows asked of the expert: {asked}")
     print(f"saved in {out}: student.onnx, student.safetensors, report.json, figures/, ...")
+
+
+def _remembered(folder: Path) -> dict[str, Any]:
+    """Return the arguments that a run was begun with.
+
+    Raises:
+        SettingError: If there are none, or the environment would import a module that only a
+            file names.
+    """
+    try:
+        arguments = json.loads((folder / COMMAND).read_bytes())
+    except (OSError, ValueError) as error:
+        raise SettingError(
+            f"{folder} has no {COMMAND} ({type(error).__name__})",
+            "a folder that `fdtasil distill --out` has begun",
+            f"repeat the arguments: fdtasil distill EXPERT ENV ... --resume {folder}",
+        ) from error
+    if ":" in (arguments["env"] or ""):
+        raise SettingError(
+            f"{folder / COMMAND} names the environment {arguments['env']!r}",
+            "an id without a module: importing one runs code, and a file may not ask for that",
+            f"repeat the arguments: fdtasil distill EXPERT ENV ... --resume {folder}",
+        )
+    tuples = {name: tuple(v) for name, v in arguments.items() if isinstance(v, list)}
+    return {**arguments, **tuples}
 
 
 def _export_sb3(**arguments: Any) -> None:
@@ -94,6 +132,8 @@ def _evaluate(**arguments: Any) -> None:
 def _side_by_side(result: Distilled, cloning: Distilled | None) -> str:
     """Return a table of expert, plain cloning and student."""
     ours = result.evaluation
+    if ours is None:
+        return f"{result.report['env']}: trained without an evaluation"
     lines = [
         f"{result.report['env']}, {ours.episodes} paired episodes of {ours.horizon} steps",
         f"{'':15}{'return':>10}{'normalised':>12}{'95 % interval':>18}{'survival':>10}",
@@ -101,7 +141,7 @@ def _side_by_side(result: Distilled, cloning: Distilled | None) -> str:
     ]
     students = {"plain cloning": cloning, "student": result}
     for name, one in students.items():
-        if one is not None:
+        if one is not None and one.evaluation is not None:
             e = one.evaluation
             interval = f"[{e.ci95[0]:.3f}, {e.ci95[1]:.3f}]"
             lines.append(
@@ -133,8 +173,9 @@ def as_command(
     parameters = [
         _shell_parameter(parameter, shell_types)
         for name, parameter in inspect.signature(function).parameters.items()
-        if name != "progress"  # bars are silent by themselves where there is no terminal
+        if name not in _ONLY_PYTHON
     ]
+    parameters = [parameter for parameter in parameters if parameter.name not in added]
     for name, (kind, default, _) in added.items():
         parameters.append(
             inspect.Parameter(
@@ -150,6 +191,8 @@ def as_command(
     return command
 
 
+# Bars are silent by themselves where there is no terminal; a function has no name in a shell.
+_ONLY_PYTHON = ("progress", "callback")
 _METAVARS: dict[Any, str] = {tuple: "INT [INT ...]", int: "INT", float: "FLOAT"}
 
 
@@ -171,9 +214,17 @@ COMMANDS: dict[str, Callable[..., None]] = {
     "distill": as_command(
         distill,
         _distill,
-        {"expert": ExpertPath, "env": EnvironmentId, "probes": str, "trainer": str},
         {
-            "out": (Path, Path("runs/latest"), "Folder that the run is saved in."),
+            "expert": OptionalExpert,
+            "env": OptionalEnvironment,
+            "probes": str,
+            "trainer": str,
+            "demonstrations": str | None,
+            "student_obs": tuple[int, ...] | None,
+            "resume": Path | None,
+        },
+        {
+            "out": (Path, Path("runs/latest"), "Folder of the run."),
             "compare": (bool, False, "Also clone plainly, without probes, and show both."),
         },
     ),

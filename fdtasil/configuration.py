@@ -6,7 +6,6 @@ from typing import Any
 from fdtasil.errors import SettingError
 from fdtasil.fit import Fit
 from fdtasil.probes import Probes
-from fdtasil.student import StudentShape
 from fdtasil.trainers import Trainer, describe_trainer
 
 __all__ = ["GATE_STATES", "Configuration", "check_count"]
@@ -20,27 +19,41 @@ class Configuration:
     """What a run does, with nothing left open.
 
     Attributes:
-        expert: What the expert is called.
+        expert: What the expert is called, or None where there is none.
         expert_sha256: Of its file, or None.
         env: What the environment is called.
-        trainer: Who acts in which round.
+        trainer: Who acts in which round; None where the demonstrations are given.
+        demonstrations: sha256 of given demonstrations, or None.
+        states: Number of given states, or None.
         probes: The derivative source, or None for plain behaviour cloning.
-        student: The network.
+        probes_given: Whether the answers to the probes are given with the demonstrations.
+        order: 0, 1 or 2, the order of the Taylor loss.
+        observation_size: n, of the expert.
+        student_obs: The student's coordinates, or what its function is called, or None for all.
+        hidden: Widths of the student's hidden layers.
+        activation: Of the student.
         fit: The optimisation.
         episodes: Number of demonstrations.
-        horizon: T, steps after which an episode is cut.
+        horizon: T, steps after which an episode is cut; 0 without an environment.
         seed: The one seed.
         device: Where the student is trained.
-        evaluation_episodes: Paired episodes of the evaluation.
+        evaluation_episodes: Paired episodes of the evaluation; 0 where nothing can be compared.
         max_queries: The most that the expert may be asked, or None.
     """
 
-    expert: str
+    expert: str | None
     expert_sha256: str | None
     env: str
-    trainer: Trainer
+    trainer: Trainer | None
+    demonstrations: str | None
+    states: int | None
     probes: Probes | None
-    student: StudentShape
+    probes_given: bool
+    order: int
+    observation_size: int
+    student_obs: tuple[int, ...] | str | None
+    hidden: tuple[int, ...]
+    activation: str
     fit: Fit
     episodes: int
     horizon: int
@@ -49,26 +62,20 @@ class Configuration:
     evaluation_episodes: int
     max_queries: int | None
 
-    def __post_init__(self) -> None:
-        check_count("episodes", self.episodes)
-        check_count("evaluation_episodes", self.evaluation_episodes)
-
     def predicted_queries(self) -> dict[str, int]:
         """Return the rows that the run will ask the expert for, by purpose.
 
         Exact where no episode ends early and every coordinate moves; an upper bound elsewhere.
         """
-        states = self.episodes * self.horizon
-        probe = 0
-        if self.probes is not None:
-            visits = self.fit.visits(states)
-            probe = self.probes.queries(states, self.student.observation_size, visits)
-        return {
-            "check": 2 * GATE_STATES * _ROWS_A_STATE,
-            **self.trainer.queries(self.episodes, self.horizon),
-            "probe": probe,
-            "evaluate": 2 * self.evaluation_episodes * self.horizon,
-        }
+        found = {"check": 0, "act": 0, "label": 0, "probe": 0, "evaluate": 0}
+        if self.evaluation_episodes:
+            found["check"] = 2 * GATE_STATES * _ROWS_A_STATE
+            found["evaluate"] = 2 * self.evaluation_episodes * self.horizon
+        if self.trainer is not None:
+            found |= self.trainer.queries(self.episodes, self.horizon)
+        if self.probes is not None and not self.probes_given:
+            found["probe"] = self._predicted_probes(self.probes)
+        return found
 
     def check_budget(self) -> None:
         """Refuse a run that may ask more than it is allowed to.
@@ -90,16 +97,31 @@ class Configuration:
     def to_json(self) -> dict[str, Any]:
         """Return the configuration as plain JSON values."""
         plain = {
-            name: value
+            name: list(value) if isinstance(value, tuple) else value
             for name, value in vars(self).items()
-            if isinstance(value, (str, int, float, type(None)))
+            if isinstance(value, (str, int, float, tuple, type(None)))
         }
         return plain | {
-            "trainer": describe_trainer(self.trainer),
+            "trainer": describe_trainer(self.trainer) if self.trainer else "none",
             "probes": self.probes.describe() if self.probes else "none",
-            "student": {**asdict(self.student), "hidden": list(self.student.hidden)},
             "fit": asdict(self.fit),
         }
+
+    def _predicted_probes(self, probes: Probes) -> int:
+        """Return the probe rows of all rounds.
+
+        New states are asked about once; a source that resamples asks about all states again, for
+        every pool but the first of every round.
+        """
+        counts = self.trainer.rounds(self.episodes) if self.trainer else [0]
+        collected, total = 0, 0
+        for count in counts:
+            new = count * self.horizon if self.states is None else self.states
+            collected += new
+            once = probes.queries(1, self.observation_size, visits=1)
+            pools = probes.pools(self.observation_size, self.fit.visits(collected))
+            total += once * new + once * collected * (pools - 1)
+        return total
 
 
 def check_count(name: str, value: int) -> int:

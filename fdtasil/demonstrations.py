@@ -1,14 +1,12 @@
 """States, expert actions and probe answers: made, pooled, kept on disk."""
 
-import io
-import zipfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 
-from fdtasil.errors import ExpertError, SettingError, StorageError
+from fdtasil.errors import ExpertError, SettingError
 from fdtasil.experts import Expert
 from fdtasil.probes import Probes
 from fdtasil.rollouts import Episodes
@@ -19,7 +17,6 @@ __all__ = [
     "Statistics",
     "ask_probes",
     "label",
-    "probed_dimension",
     "statistics",
 ]
 
@@ -67,13 +64,19 @@ class Statistics:
         mean: (n,) of the states.
         scale: (n,) what the student's normaliser divides by; 1 for coordinates that do not move.
         deviation: (n,) standard deviation of the states.
-        live: (n,) bool, whether the coordinate moves, and is probed in whitened space.
+        live: (n,) bool, whether the coordinate moves; others are not probed in whitened space.
+        seen: (n,) bool, whether the student sees the coordinate; others are never probed.
     """
 
     mean: np.ndarray
     scale: np.ndarray
     deviation: np.ndarray
     live: np.ndarray
+    seen: np.ndarray
+
+    def probed(self, space: str | None) -> np.ndarray:
+        """Return (n,) bool, the coordinates that are probed in a space."""
+        return self.seen if space == "raw" else self.seen & self.live
 
 
 @dataclass(frozen=True)
@@ -85,7 +88,7 @@ class Answers:
             exact stencil the directions that were differentiated along.
         numbers: (N, k) int32, the rows of the bank that each state was probed along.
         values: (N, k, p, m) float32 expert actions at state + offset * displacement for each of
-            the stencil's p offsets; for an exact stencil p is 1 and they are derivatives.
+            the stencil's p offsets; for an exact stencil they are the p first derivatives.
         gain: What turns a difference of values into the whitened Jacobian's Frobenius norm,
             in expectation over directions: sqrt(d) / step.
     """
@@ -129,11 +132,12 @@ def label(episodes: Episodes, expert: Expert, first_episode: int, round_: int) -
     return Demonstrations(observations, actions, episode, np.full(len(episode), round_, np.int32))
 
 
-def statistics(observations: np.ndarray) -> Statistics:
+def statistics(observations: np.ndarray, seen: np.ndarray | None = None) -> Statistics:
     """Measure the scale of each coordinate.
 
     Args:
         observations: (N, n) raw observations.
+        seen: (n,) bool, the coordinates that the student sees; None for all.
     """
     wide = observations.astype(np.float64)
     mean, deviation = wide.mean(axis=0), wide.std(axis=0)
@@ -141,12 +145,7 @@ def statistics(observations: np.ndarray) -> Statistics:
     median = float(np.median(deviation[moving])) if moving.any() else 1.0
     live = moving & (deviation > _STILL * median)
     scale = np.where(live, np.maximum(deviation, _FLOOR * median), 1.0)
-    return Statistics(mean, scale, deviation, live)
-
-
-def probed_dimension(probes: Probes, scales: Statistics) -> int:
-    """Return d, the number of coordinates that are probed."""
-    return len(scales.live) if probes.space == "raw" else int(scales.live.sum())
+    return Statistics(mean, scale, deviation, live, np.ones_like(live) if seen is None else seen)
 
 
 def ask_probes(
@@ -155,6 +154,7 @@ def ask_probes(
     probes: Probes,
     scales: Statistics,
     random: np.random.Generator,
+    order: int = 1,
 ) -> Answers:
     """Ask the expert around each state.
 
@@ -164,14 +164,14 @@ def ask_probes(
         probes: The derivative source, with radius and space set.
         scales: Of the demonstrations.
         random: Draws the directions.
+        order: 1, or 2 for exact second derivatives too; a finite stencil has them in its values.
 
     Raises:
         ExpertError: If the stencil is exact and the expert can't be differentiated.
         SettingError: If no coordinate moves, or a step is lost in rounding.
     """
-    step_scale = np.ones(len(scales.live))
-    if probes.space != "raw":
-        step_scale = np.where(scales.live, scales.deviation, 0.0)
+    deviation = 1.0 if probes.space == "raw" else scales.deviation
+    step_scale = np.where(scales.probed(probes.space), deviation, 0.0)
     live = np.flatnonzero(step_scale)
     if not len(live):
         raise SettingError(
@@ -179,15 +179,18 @@ def ask_probes(
             "states that differ",
             "record longer or more episodes, or pass probes=0",
         )
-    assert probes.radius is not None, "the pipeline sets the radius"
+    assert probes.radius is not None, "the preset sets the radius"
+    assert probes.stencil is not None, "the order sets the stencil"
     reach = 1.0 if probes.space == "raw" else probes.directions.reach(len(live))
     step = 1.0 if probes.stencil.exact else probes.radius * reach
     bank, numbers = probes.directions.draw(len(observations), len(live), random)
     displacements = np.zeros((len(bank), len(step_scale)), np.float32)
     displacements[:, live] = step * bank * step_scale[live]
     gain = len(live) ** 0.5 / step
-    ask = _differentiate if probes.stencil.exact else _ask_values
-    values = ask(expert, observations, displacements, numbers, probes.stencil.offsets)
+    if probes.stencil.exact:
+        values = _differentiate(expert, observations, displacements, numbers, order)
+    else:
+        values = _ask_values(expert, observations, displacements, numbers, probes.stencil.offsets)
     return Answers(displacements, numbers, values, gain)
 
 
@@ -229,9 +232,9 @@ def _differentiate(
     observations: np.ndarray,
     directions: np.ndarray,
     numbers: np.ndarray,
-    offsets: Sequence[float],
+    order: int,
 ) -> np.ndarray:
-    """Return the exact directional derivatives, (N, k, 1, m)."""
+    """Return the exact directional derivatives up to `order`, (N, k, order, m)."""
     module = expert.module
     if module is None:
         raise ExpertError(
@@ -240,50 +243,30 @@ def _differentiate(
             'probe it instead: probes="basis" or probes=10',
         )
     place = next(module.parameters(), torch.zeros(()))
-    jacobian = torch.func.vmap(torch.func.jacrev(lambda x: module(x[None])[0]))
+    along = torch.func.vmap(_derivatives_along(module, order), in_dims=(None, 0))
+    every = torch.func.vmap(along)
     parts = []
-    for start in range(0, len(observations), 256):
-        rows = slice(start, start + 256)
+    for start in range(0, len(observations), 64):
+        rows = slice(start, start + 64)
         states = torch.from_numpy(observations[rows]).to(place.device, place.dtype)
+        moved = torch.from_numpy(directions[numbers[rows]]).to(place.device, place.dtype)
         with torch.no_grad():
-            full = jacobian(states).float().cpu()
-        along = torch.from_numpy(directions[numbers[rows]])
-        parts.append(torch.einsum("bmn,bkn->bkm", full, along).numpy())
-    return np.concatenate(parts)[:, :, None, :]
+            parts.append(every(states, moved).float().cpu().numpy())
+    return np.concatenate(parts)
 
 
-def to_npz(demonstrations: Demonstrations, answers: Answers | None) -> bytes:
-    """Return demonstrations and answers as an npz file.
+def _derivatives_along(
+    module: torch.nn.Module, order: int
+) -> Callable[[torch.Tensor, torch.Tensor], torch.Tensor]:
+    """Return the function from a state and a direction to the (order, m) derivatives there."""
 
-    Schema: `observations`, `actions`, `episode`, `round` as in `Demonstrations`; with probes also
-    `displacements`, `numbers`, `values`, `gain` as in `Answers`.
-    """
-    arrays = dict(vars(demonstrations)) | (dict(vars(answers)) if answers else {})
-    target = io.BytesIO()
-    np.savez(target, **arrays)
-    return target.getvalue()
+    def first(x: torch.Tensor, direction: torch.Tensor) -> torch.Tensor:
+        return torch.func.jvp(lambda y: module(y[None])[0], (x,), (direction,))[1]
 
+    def derivatives(x: torch.Tensor, direction: torch.Tensor) -> torch.Tensor:
+        if order == 1:
+            return first(x, direction)[None]
+        both = torch.func.jvp(lambda y: first(y, direction), (x,), (direction,))
+        return torch.stack(both[:2])
 
-def from_npz(data: bytes) -> tuple[Demonstrations, Answers | None]:
-    """Read what `to_npz` wrote.
-
-    Raises:
-        StorageError: If it is not such a file.
-    """
-    try:
-        with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-            demonstrations = Demonstrations(
-                arrays["observations"], arrays["actions"], arrays["episode"], arrays["round"]
-            )
-            if "values" not in arrays:
-                return demonstrations, None
-            bank, numbers, values = (
-                arrays[name] for name in ("displacements", "numbers", "values")
-            )
-            return demonstrations, Answers(bank, numbers, values, float(arrays["gain"]))
-    except (KeyError, ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
-        raise StorageError(
-            f"not demonstrations: {error}",
-            "a demonstrations.npz written by fdtasil",
-            "check the path, or save again",
-        ) from error
+    return derivatives

@@ -10,13 +10,15 @@ from typing import Any
 
 import numpy as np
 
-from fdtasil.demonstrations import Answers, Demonstrations, from_npz, to_npz
+from fdtasil.datasets import Dataset
+from fdtasil.demonstrations import Answers, Demonstrations
 from fdtasil.errors import StorageError
 from fdtasil.evaluation import Evaluation
 from fdtasil.figures import draw_returns, draw_training
 from fdtasil.onnx_files import export_module
 from fdtasil.storage import to_json, verify, write_bytes, write_folder
 from fdtasil.student import Student
+from fdtasil.views import View
 
 __all__ = ["Distilled"]
 
@@ -29,15 +31,16 @@ class Distilled:
 
     Attributes:
         student: The policy, on the CPU.
-        evaluation: Student against expert, from the same starts.
+        evaluation: Student against expert, from the same starts; None where there was no expert
+            or no environment to compare them in.
         history: Training losses, one entry for each 100 steps: round, step, loss, action_error,
-            derivative_error.
+            derivative_error, curvature_error, validation_loss.
         queries: Rows that the expert answered, by purpose: act, label, probe, check (the gate),
             evaluate.
         settings: The exact arguments and what they resolved to, with versions; plain JSON.
         report: What `report.json` holds.
-        demonstrations: The labelled states.
-        answers: The expert's answers to the probes, or None.
+        dataset: The labelled states and the expert's answers around them; give it to
+            `distill(demonstrations=...)` to train another student without asking.
 
     Example:
         >>> import fdtasil, numpy as np
@@ -50,13 +53,23 @@ class Distilled:
     """
 
     student: Student
-    evaluation: Evaluation
+    evaluation: Evaluation | None
     history: list[dict[str, float]]
     queries: dict[str, int]
     settings: dict[str, Any]
     report: dict[str, Any]
-    demonstrations: Demonstrations
-    answers: Answers | None
+    dataset: Dataset
+    view: View
+
+    @property
+    def demonstrations(self) -> Demonstrations:
+        """The labelled states."""
+        return self.dataset.demonstrations
+
+    @property
+    def answers(self) -> Answers | None:
+        """The expert's answers to the probes, or None."""
+        return self.dataset.answers
 
     def onnx_bytes(self) -> bytes:
         """Return the student as one ONNX file, compared with torch on its own training states.
@@ -66,7 +79,7 @@ class Distilled:
         """
         states = self.demonstrations.observations
         chosen = np.linspace(0, len(states) - 1, min(len(states), _PARITY_STATES)).astype(int)
-        return export_module(self.student, states[chosen], self._metadata())
+        return export_module(self.student, self.view.look(states[chosen]), self._metadata())
 
     def to_onnx(self, path: str | Path) -> Path:
         """Write the student as one ONNX file: input `obs` (batch, n), output `actions`.
@@ -84,7 +97,8 @@ class Distilled:
         """Write the run folder.
 
         Files: config.json, report.json, progress.csv, demonstrations.npz, student.safetensors,
-        student.onnx, figures/training.png, figures/returns.png, and last a manifest.
+        student.onnx, figures/training.png, figures/returns.png (of an evaluation), and last a
+        manifest.
 
         Raises:
             StorageError: If a file can't be written; finished files stay whole.
@@ -92,13 +106,14 @@ class Distilled:
         files = {
             "config.json": to_json(self.settings),
             "progress.csv": _csv(self.history),
-            "demonstrations.npz": to_npz(self.demonstrations, self.answers),
+            "demonstrations.npz": self.dataset.to_bytes(),
             "student.safetensors": self.student.to_bytes(self._metadata()),
             "student.onnx": self.onnx_bytes(),
             "figures/training.png": draw_training(self.history),
-            "figures/returns.png": draw_returns(self.evaluation),
             "report.json": to_json(self.report),
         }
+        if self.evaluation is not None:
+            files["figures/returns.png"] = draw_returns(self.evaluation)
         write_folder(Path(folder), files)
         return Path(folder)
 
@@ -112,16 +127,18 @@ class Distilled:
         files = verify(Path(folder))
         try:
             report = json.loads(files["report.json"])
-            demonstrations, answers = from_npz(files["demonstrations.npz"])
+            settings = json.loads(files["config.json"])
+            dataset = Dataset.from_bytes(files["demonstrations.npz"])
+            evaluation = report["evaluation"]
             return cls(
                 student=Student.from_bytes(files["student.safetensors"]),
-                evaluation=Evaluation.from_json(report["evaluation"]),
+                evaluation=Evaluation.from_json(evaluation) if evaluation else None,
                 history=_read_csv(files["progress.csv"]),
                 queries=report["queries"],
-                settings=json.loads(files["config.json"]),
+                settings=settings,
                 report=report,
-                demonstrations=demonstrations,
-                answers=answers,
+                dataset=dataset,
+                view=_stored_view(settings["student_obs"], dataset),
             )
         except (KeyError, TypeError, ValueError) as error:
             raise StorageError(
@@ -131,19 +148,27 @@ class Distilled:
             ) from error
 
     def _metadata(self) -> Mapping[str, str]:
-        expert = self.report["expert"]
         low, high = self.student.low.tolist(), self.student.high.tolist()
-        return {
+        metadata = {
             "fdtasil.version": self.report["versions"]["fdtasil"],
             "fdtasil.environment": self.report["env"],
             "fdtasil.observation_size": str(self.student.shape.observation_size),
             "fdtasil.action_low": ",".join(f"{value:g}" for value in low),
             "fdtasil.action_high": ",".join(f"{value:g}" for value in high),
-            "fdtasil.expert_sha256": expert["sha256"] or "",
-            "fdtasil.expert_return": f"{self.evaluation.expert_return:.6g}",
-            "fdtasil.student_return": f"{self.evaluation.student_return:.6g}",
-            "fdtasil.normalized_return": f"{self.evaluation.normalized_return:.6g}",
+            "fdtasil.expert_sha256": self.report["expert"]["sha256"] or "",
         }
+        if self.view.columns is not None:
+            metadata["fdtasil.observation_columns"] = ",".join(map(str, self.view.columns))
+        if self.evaluation is not None:
+            for name in ("expert_return", "student_return", "normalized_return"):
+                metadata[f"fdtasil.{name}"] = f"{getattr(self.evaluation, name):.6g}"
+        return metadata
+
+
+def _stored_view(student_obs: list[int] | str | None, dataset: Dataset) -> View:
+    if isinstance(student_obs, str):
+        raise ValueError(f"the student sees through {student_obs}, which no file can hold")
+    return View.of(student_obs, dataset.demonstrations.observations[:2])
 
 
 def _csv(history: list[dict[str, float]]) -> bytes:

@@ -64,8 +64,10 @@ class EnvironmentPool:
 
     def take(self, count: int) -> list[gymnasium.Env]:
         """Return up to `count` copies; fewer where only one exists."""
-        while self._owned and len(self._members) < count:
-            self._members.append(self._new())
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # the first copy has said it all
+            while self._owned and len(self._members) < count:
+                self._members.append(self._new())
         return self._members[:count]
 
     def close(self) -> None:

@@ -1,8 +1,9 @@
 """Minibatch optimisation of a student; knows no environment and no expert."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
-from itertools import chain, count, islice
+import math
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass, field
+from itertools import count, islice
 
 import numpy as np
 import torch
@@ -11,11 +12,12 @@ from torch import Tensor
 from fdtasil.batches import Batches
 from fdtasil.demonstrations import Answers, Demonstrations
 from fdtasil.errors import FitError, SettingError
-from fdtasil.loss import taylor_loss
+from fdtasil.fitstate import FitState
+from fdtasil.loss import Minibatch, Weights, taylor_loss
 from fdtasil.probes import Probes
 from fdtasil.student import Student
 
-__all__ = ["Fit", "Progress", "fit"]
+__all__ = ["Fit", "Hooks", "fit"]
 
 _LOG_EVERY = 100  # steps between two entries of the history; reading a loss waits for the device
 
@@ -32,6 +34,13 @@ class Fit:
         weight_decay: Decoupled weight decay.
         epsilon: AdamW's epsilon.
         weight: lambda_1, the weight of the derivative error.
+        curvature_weight: lambda_2, the weight of the error of the second differences, in a loss
+            of second order.
+        max_gradient_norm: Longer gradients are scaled to this norm; None leaves them.
+        validation: Share of the episodes held out, by which the best weights are chosen; 0 keeps
+            the last weights. A round with a single episode holds none out.
+        patience: Validations (one each 100 steps) without a better one after which training
+            stops; None goes on to the end.
     """
 
     steps: int | None
@@ -41,23 +50,36 @@ class Fit:
     weight_decay: float
     epsilon: float
     weight: float
+    curvature_weight: float
+    max_gradient_norm: float | None
+    validation: float
+    patience: int | None
 
     def __post_init__(self) -> None:
         if (self.steps is None) == (self.epochs is None):
-            raise SettingError(
-                f"steps={self.steps}, epochs={self.epochs}", "one of the two", "leave one out"
-            )
-        for name in ("steps", "epochs", "batch_size"):
+            found = f"steps={self.steps}, epochs={self.epochs}"
+            raise SettingError(found, "one of the two", "leave one out")
+        for name in ("steps", "epochs", "batch_size", "patience"):
             value = getattr(self, name)
-            if value is None:
-                continue
-            if isinstance(value, bool) or not isinstance(value, int) or value < 1:
-                raise SettingError(f"{name}={value!r}", "a positive integer", "raise it")
-        for name in ("learning_rate", "weight_decay", "epsilon", "weight"):
-            if not 0 <= getattr(self, name) < float("inf"):
-                raise SettingError(
-                    f"{name}={getattr(self, name)!r}", "a number of at least 0", "raise it"
-                )
+            whole = isinstance(value, int) and not isinstance(value, bool) and value > 0
+            if value is not None and not whole:
+                raise SettingError(f"{name}={value!r}", "a positive integer", f"write {name}=100")
+        for name in ("learning_rate", "weight_decay", "epsilon", "weight", "curvature_weight"):
+            value = getattr(self, name)
+            if not 0 <= value < math.inf:
+                raise SettingError(f"{name}={value!r}", "a number of at least 0", "raise it")
+        if self.max_gradient_norm is not None and not 0 < self.max_gradient_norm < math.inf:
+            found = f"max_gradient_norm={self.max_gradient_norm!r}"
+            raise SettingError(found, "a positive number", "write for example 1.0")
+        if not 0 <= self.validation < 1:
+            found = f"validation={self.validation!r}"
+            raise SettingError(found, "a share from 0 to below 1", "write for example 0.2")
+        if self.patience is not None and self.validation == 0:
+            raise SettingError(
+                f"patience={self.patience} without validation",
+                "held-out episodes to judge by",
+                "write for example validation=0.2",
+            )
 
     def steps_an_epoch(self, states: int) -> int:
         """Return the minibatches that visit each of `states` states once."""
@@ -74,8 +96,17 @@ class Fit:
         return -(-self.total_steps(states) // self.steps_an_epoch(states))
 
 
-Progress = Callable[[int], None]
-"""Told the number of gradient steps just done."""
+@dataclass(frozen=True)
+class Hooks:
+    """Who is told of a training's progress.
+
+    Attributes:
+        entry: Told each new entry of the history.
+        checkpoint: Told the state at the end of each epoch; must not keep it.
+    """
+
+    entry: Callable[[dict[str, float]], None] = field(default=lambda entry: None)
+    checkpoint: Callable[[FitState], None] = field(default=lambda state: None)
 
 
 def fit(
@@ -84,8 +115,11 @@ def fit(
     probes: Probes | None,
     answers: Callable[[int], Answers] | None,
     settings: Fit,
-    random: torch.Generator,
-    on_steps: Progress = lambda count: None,
+    random: Callable[[str], torch.Generator],
+    *,
+    order: int = 1,
+    hooks: Hooks | None = None,
+    resume: bytes | None = None,
 ) -> list[dict[str, float]]:
     """Optimise a student in place.
 
@@ -99,18 +133,26 @@ def fit(
         answers: Number of the pool -> the expert's answers; asked for pool 0, and for the next
             one when the answers are used up, if the source resamples. None without probes.
         settings: How.
-        random: Draws the minibatches.
-        on_steps: Told of progress.
+        random: Name of a stream -> its generator.
+        order: 1, or 2 to match second differences too.
+        hooks: Who is told of progress.
+        resume: The bytes of a state given to `hooks.checkpoint` by an earlier call with the same
+            arguments; the result is the same as without the interruption, to the byte.
 
     Returns:
-        One entry for each 100 steps: step, loss, action_error, derivative_error (means since the
-        last entry).
+        One entry for each 100 steps: step, loss, action_error, derivative_error,
+        curvature_error (means since the last entry), and validation_loss (the loss itself where
+        nothing is held out).
 
     Raises:
         FitError: If the loss is not finite; the student is of no use then.
     """
-    batches = Batches(demonstrations, probes, answers, random, student.mean.device)
-    steps = settings.total_steps(len(demonstrations))
+    told = hooks or Hooks()
+    device = student.mean.device
+    batches = Batches(demonstrations, probes, answers, random, device)
+    training, held_out = _split(demonstrations, settings, random("held out"))
+    per_epoch = settings.steps_an_epoch(len(training))
+    steps = settings.total_steps(len(training))
     optimiser = torch.optim.AdamW(
         student.parameters(),
         lr=settings.learning_rate,
@@ -118,34 +160,76 @@ def fit(
         eps=settings.epsilon,
         fused=True,
     )
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
-    per_epoch = settings.steps_an_epoch(len(demonstrations))
+    weights = Weights(settings.weight, settings.curvature_weight if order == 2 else None)
     stencil = probes.stencil if probes else None
-    history: list[dict[str, float]] = []
-    recent: list[Tensor] = []
+    state = FitState(student, optimiser)
+    if resume is not None:
+        state.restore(resume)
+
+    def loss_of(batch: Minibatch) -> Tensor:
+        loss = taylor_loss(student, batch, stencil, weights, batches.gain)
+        return torch.stack([loss.total, loss.action, loss.derivative, loss.curvature])
+
+    first_epoch = state.step // per_epoch
+    dealt = _deal(batches, training, per_epoch, first_epoch)
     student.train()
-    epochs = (batches.epoch(number, per_epoch) for number in count())
-    for step, batch in enumerate(islice(chain.from_iterable(epochs), steps)):
-        loss = taylor_loss(student, batch, stencil, settings.weight, batches.gain)
+    for batch in islice(dealt, max(0, steps - state.step)):
+        if state.step % per_epoch == 0 and state.step > 0:
+            told.checkpoint(state)
+        optimiser.param_groups[0]["lr"] = _cosine(settings.learning_rate, state.step, steps)
+        losses = loss_of(batch)
         optimiser.zero_grad(set_to_none=True)
-        loss.total.backward()
+        losses[0].backward()
+        if settings.max_gradient_norm is not None:
+            torch.nn.utils.clip_grad_norm_(student.parameters(), settings.max_gradient_norm)
         optimiser.step()
-        schedule.step()
-        recent.append(torch.stack([loss.total, loss.action, loss.derivative]).detach())
-        if (step + 1) % _LOG_EVERY == 0 or step + 1 == steps:
-            history.append(_entry(step + 1, recent))
-            on_steps(len(recent))
-            recent = []
+        state.count(losses.detach())
+        if state.step % _LOG_EVERY == 0 or state.step == steps:
+            held = _held_out_loss(loss_of, batches, held_out) if len(held_out) else None
+            entry = state.log(held)
+            _check_finite(entry)
+            told.entry(entry)
+            if settings.patience is not None and state.stale >= settings.patience:
+                break
+    state.keep_best()
     student.eval()
-    return history
+    return state.history
 
 
-def _entry(step: int, recent: list[Tensor]) -> dict[str, float]:
-    total, action, derivative = torch.stack(recent).mean(dim=0).tolist()
-    if not np.isfinite(total):
+def _deal(batches: Batches, rows: Tensor, per_epoch: int, first_epoch: int) -> Iterator[Minibatch]:
+    for number in count(first_epoch):
+        yield from batches.epoch(number, rows, per_epoch)
+
+
+def _split(
+    demonstrations: Demonstrations, settings: Fit, random: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """Return the rows to train on and those of held-out episodes."""
+    everything = torch.arange(len(demonstrations))
+    episodes = np.unique(demonstrations.episode)
+    if settings.validation == 0 or len(episodes) < 2:
+        return everything, everything[:0]
+    held = min(max(1, round(settings.validation * len(episodes))), len(episodes) - 1)
+    chosen = episodes[torch.randperm(len(episodes), generator=random)[:held].numpy()]
+    outside = torch.from_numpy(np.isin(demonstrations.episode, chosen))
+    return everything[~outside], everything[outside]
+
+
+def _held_out_loss(
+    loss_of: Callable[[Minibatch], Tensor], batches: Batches, rows: Tensor
+) -> float:
+    # Always the same visit, so that two validations differ by the student alone.
+    return float(loss_of(batches.visit(rows, 0))[0].detach())
+
+
+def _cosine(peak: float, step: int, steps: int) -> float:
+    return peak * 0.5 * (1 + math.cos(math.pi * step / steps))
+
+
+def _check_finite(entry: dict[str, float]) -> None:
+    if not math.isfinite(entry["loss"]):
         raise FitError(
-            f"the loss became {total} near step {step}",
+            f"the loss became {entry['loss']} near step {entry['step']:.0f}",
             "finite numbers",
             "lower learning_rate, or check the expert's answers for outliers",
         )
-    return {"step": step, "loss": total, "action_error": action, "derivative_error": derivative}

@@ -7,7 +7,7 @@ from torch import Tensor, nn
 
 from fdtasil.probes import Stencil
 
-__all__ = ["Minibatch", "TaylorLoss", "taylor_loss"]
+__all__ = ["Minibatch", "TaylorLoss", "Weights", "taylor_loss"]
 
 
 @dataclass(frozen=True)
@@ -18,7 +18,7 @@ class Minibatch:
         observations: (B, n).
         actions: (B, m) expert actions.
         displacements: (B, k, n) where each state is probed, or None without probes.
-        values: (B, k, p, m) what the expert said there, or None.
+        values: (B, k, p, m) what the expert said there, or None; see `Answers`.
     """
 
     observations: Tensor
@@ -28,60 +28,86 @@ class Minibatch:
 
 
 @dataclass(frozen=True)
-class TaylorLoss:
-    """The loss of a minibatch and its two parts.
+class Weights:
+    """The weights of the loss's terms; that of the actions is 1.
 
     Attributes:
-        total: (), what is minimised: `action + weight * derivative`.
+        derivative: lambda_1.
+        curvature: lambda_2, or None for a loss of first order.
+    """
+
+    derivative: float
+    curvature: float | None = None
+
+
+@dataclass(frozen=True)
+class TaylorLoss:
+    """The loss of a minibatch and its parts.
+
+    Attributes:
+        total: (), what is minimised.
         action: (), mean norm of the action error.
-        derivative: (), mean norm of the error of the differences, in units of the Jacobian's
-            Frobenius norm; 0 without probes.
+        derivative: (), mean norm of the error of the first differences, in units of the whitened
+            Jacobian's Frobenius norm; 0 without probes.
+        curvature: (), mean norm of the error of the second differences, in units of z'Hz for
+            standard normal z in whitened coordinates; 0 in a loss of first order.
     """
 
     total: Tensor
     action: Tensor
     derivative: Tensor
+    curvature: Tensor
 
 
 def taylor_loss(
-    student: nn.Module, batch: Minibatch, stencil: Stencil | None, weight: float, gain: float
+    student: nn.Module, batch: Minibatch, stencil: Stencil | None, weights: Weights, gain: float
 ) -> TaylorLoss:
-    """Compare a student with the expert's answers (TaSIL, equation 5 with p = 1; appendix).
+    """Compare a student with the expert's answers (TaSIL, equation 5, p = 0, 1, 2; appendix).
 
     Student and expert are differenced on the same float32 points, so the loss is zero at the
-    expert whatever the radius and however rough the expert. Both norms are unsquared, as in the
+    expert whatever the radius and however rough the expert. All norms are unsquared, as in the
     paper's experiments.
 
     Args:
         student: (B, n) -> (B, m).
         batch: B states with k probes each.
-        stencil: How the expert was differenced; None without probes.
-        weight: lambda_1, the weight of the derivative error.
-        gain: From `Answers`, so that the weight means the same for every design, number of
+        stencil: How the expert was differenced; None without probes (p = 0).
+        weights: Of the terms.
+        gain: From `Answers`, so that the weights mean the same for every design, number of
             probes and radius.
 
     Example:
         >>> batch = Minibatch(torch.zeros(2, 3), torch.ones(2, 3))
-        >>> taylor_loss(nn.Identity(), batch, None, weight=0.0, gain=1.0).total
+        >>> taylor_loss(nn.Identity(), batch, None, Weights(0.0), gain=1.0).total
         tensor(1.7321)
     """
     if stencil is None or batch.displacements is None or batch.values is None:
         action = _mean_norm(student(batch.observations) - batch.actions)
-        return TaylorLoss(action, action, torch.zeros_like(action))
+        zero = torch.zeros_like(action)
+        return TaylorLoss(action, action, zero, zero)
+    second = weights.curvature is not None
     errors = _exact_errors if stencil.exact else _difference_errors
-    action_error, derivative_error = errors(
-        student, batch, batch.displacements, batch.values, stencil
-    )
-    probes = derivative_error.shape[1]
-    action = _mean_norm(action_error)
-    derivative = gain / probes**0.5 * _mean_norm(derivative_error.flatten(1))
-    return TaylorLoss(action + weight * derivative, action, derivative)
+    found = errors(student, batch, batch.displacements, batch.values, stencil, second=second)
+    probes = batch.displacements.shape[1]
+    action = _mean_norm(found[0])
+    derivative = gain / probes**0.5 * _mean_norm(found[1].flatten(1))
+    total, curvature = action + weights.derivative * derivative, torch.zeros_like(action)
+    if weights.curvature is not None:
+        curvature = gain**2 / probes**0.5 * _mean_norm(found[2].flatten(1))
+        total = total + weights.curvature * curvature
+    return TaylorLoss(total, action, derivative, curvature)
 
 
 def _difference_errors(
-    student: nn.Module, batch: Minibatch, displacements: Tensor, values: Tensor, stencil: Stencil
-) -> tuple[Tensor, Tensor]:
-    """Return the errors (B, m) at the states and (B, k, m) of the first differences."""
+    student: nn.Module,
+    batch: Minibatch,
+    displacements: Tensor,
+    values: Tensor,
+    stencil: Stencil,
+    *,
+    second: bool,
+) -> tuple[Tensor, ...]:
+    """Return the errors (B, m) at the states, and (B, k, m) of the first (and second) ones."""
     rows, n = batch.observations.shape
     offsets = torch.tensor(stencil.offsets, device=displacements.device)
     points = batch.observations[:, None, None, :] + displacements[:, :, None, :] * offsets[:, None]
@@ -89,21 +115,40 @@ def _difference_errors(
     answers = student(torch.cat([batch.observations, points.reshape(-1, n)]))
     action_error = answers[:rows] - batch.actions
     value_errors = answers[rows:].reshape(values.shape) - values
-    weights = torch.tensor(stencil.weights, device=displacements.device)
+
     # The difference of errors is the error of the difference: both are linear.
-    derivative_error = torch.einsum("p,bkpm->bkm", weights, value_errors)
-    return action_error, derivative_error + stencil.centre * action_error[:, None, :]
+    def difference(weights: tuple[float, ...], centre: float) -> Tensor:
+        factors = torch.tensor(weights, device=displacements.device)
+        around = torch.einsum("p,bkpm->bkm", factors, value_errors)
+        return around + centre * action_error[:, None, :]
+
+    first = difference(stencil.weights, stencil.centre)
+    if not second or stencil.second is None:
+        return action_error, first
+    *around, centre = stencil.second
+    return action_error, first, difference(tuple(around), centre)
 
 
 def _exact_errors(
-    student: nn.Module, batch: Minibatch, displacements: Tensor, values: Tensor, stencil: Stencil
-) -> tuple[Tensor, Tensor]:
-    """Return the errors (B, m) at the states and (B, k, m) of the exact derivatives."""
+    student: nn.Module,
+    batch: Minibatch,
+    displacements: Tensor,
+    values: Tensor,
+    stencil: Stencil,
+    *,
+    second: bool,
+) -> tuple[Tensor, ...]:
+    """Return the errors (B, m) at the states, and (B, k, m) of the exact derivatives."""
     count = displacements.shape[1]
     states = batch.observations.repeat_interleave(count, dim=0)
-    answers, slopes = _derivative_along(student, states, displacements.flatten(0, 1))
+    along = _second_derivative_along if second else _derivative_along
+    answers, *derivatives = along(student, states, displacements.flatten(0, 1))
     action_error = answers[::count] - batch.actions
-    return action_error, slopes.reshape(values[:, :, 0].shape) - values[:, :, 0]
+    errors = [
+        derivative.reshape(values[:, :, 0].shape) - values[:, :, order]
+        for order, derivative in enumerate(derivatives)
+    ]
+    return action_error, *errors
 
 
 def _derivative_along(
@@ -120,6 +165,19 @@ def _derivative_along(
     (pulled,) = torch.autograd.grad(answers, states, dummy, create_graph=True)
     (slopes,) = torch.autograd.grad(pulled, dummy, directions, create_graph=True)
     return answers, slopes
+
+
+def _second_derivative_along(
+    student: nn.Module, states: Tensor, directions: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return f(x), J u and u'H u, each (B, m), differentiable."""
+
+    def both(x: Tensor) -> tuple[Tensor, Tensor]:
+        answers, slopes, *_ = torch.func.jvp(student, (x,), (directions,))
+        return answers, slopes
+
+    (answers, slopes), (_, curvatures), *_ = torch.func.jvp(both, (states,), (directions,))
+    return answers, slopes, curvatures
 
 
 def _mean_norm(errors: Tensor) -> Tensor:

@@ -4,30 +4,36 @@ import time
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from fdtasil.compute import pick_device, torch_settings
 from fdtasil.configuration import GATE_STATES, Configuration, check_count
+from fdtasil.datasets import Dataset, DatasetLike, load_dataset
 from fdtasil.distilled import Distilled
 from fdtasil.environments import EnvironmentLike, EnvironmentPool, resolve_horizon
 from fdtasil.evaluation import Evaluation, compare
+from fdtasil.events import Callback, Event, tell_all
 from fdtasil.experts import Expert, ExpertLike, check_expert, load_expert
 from fdtasil.presets import preset_of
 from fdtasil.probes import Probes
 from fdtasil.progress import Stages
-from fdtasil.report import noted_warnings, report_of
+from fdtasil.report import noted_warnings, report_of, versions
 from fdtasil.rollouts import Episodes, Policy, first_observations, follow, rollout
 from fdtasil.rounds import Rounds
+from fdtasil.runfolder import RunFolder
 from fdtasil.sb3 import Trust
 from fdtasil.seeding import check_seed, episode_seeds
-from fdtasil.student import StudentShape
+from fdtasil.storage import sha256
+from fdtasil.subject import Subject, open_subject, source_of
 from fdtasil.trainers import Trainer, trainer_of
+from fdtasil.views import StudentObservation, describe_view
 
 __all__ = ["distill", "evaluate"]
 
 
 def distill(
-    expert: ExpertLike,
-    env: EnvironmentLike,
+    expert: ExpertLike | None = None,
+    env: EnvironmentLike | None = None,
     probes: int | str | Probes = 10,
     *,
     trainer: str | Trainer = "bc",
@@ -35,9 +41,12 @@ def distill(
     horizon: int | None = None,
     seed: int = 0,
     device: str = "cpu",
+    demonstrations: DatasetLike | None = None,
+    order: int = 1,
     preset: str = "standard",
     output: str | None = None,
     trust: Trust = None,
+    student_obs: StudentObservation | None = None,
     hidden: tuple[int, ...] | None = None,
     activation: str | None = None,
     steps: int | None = None,
@@ -46,9 +55,17 @@ def distill(
     learning_rate: float | None = None,
     weight_decay: float | None = None,
     weight: float | None = None,
+    curvature_weight: float | None = None,
+    max_gradient_norm: float | None = None,
+    validation: float | None = None,
+    patience: int | None = None,
     evaluation_episodes: int = 20,
     max_queries: int | None = None,
     force: bool = False,
+    out: str | Path | None = None,
+    resume: str | Path | None = None,
+    log_formats: tuple[str, ...] = (),
+    callback: Callback | None = None,
     progress: bool = True,
 ) -> Distilled:
     """Distil an expert that can only be asked into a small torch policy that reacts as it does.
@@ -60,8 +77,9 @@ def distill(
     Args:
         expert: An ONNX path, the path of a stable-baselines3 zip, a torch module, an object with
             stable-baselines3's `predict`, or a function on batches (B, n) -> (B, m) in
-            environment units.
+            environment units. None with `demonstrations`: then nobody is asked.
         env: A gymnasium id (`module:Id` too), a gymnasium environment, or a function making one.
+            None with `demonstrations`: then nothing is recorded or evaluated.
         probes: The derivative source: 0 (plain behaviour cloning), N or "sphere:N" (N random
             directions for each state, asked once), "sphere:N,resample" (asked anew while
             training), "orthogonal:N", "basis", "jacobian" (the analytic reference). Options
@@ -72,23 +90,38 @@ def distill(
         horizon: Steps after which an episode is cut; default: the environment's time limit.
         seed: Equal seeds give equal bytes, on one machine with the same versions.
         device: Where the student is trained: "cpu", "cuda".
+        demonstrations: Train from these instead of recording: a run folder, its
+            demonstrations.npz, or a `Dataset`. Stored answers to probes are used as they are.
+        order: 1, or 2 to match second differences too (central stencil, or "jacobian").
         preset: Where the defaults below come from: "standard", or "paper" (TaSIL's settings: raw
             probes of radius 0.01, weight 0.01, 4,500 epochs).
         output: Name of the ONNX output with the actions, where several could be it.
         trust: "pickle" lets stable-baselines3 load what can't be read from a zip without running
             code that is in it.
+        student_obs: Indices of the coordinates that the student sees, or a function
+            (B, n) -> (B, k); the expert sees all. Probes move only what the student sees.
         hidden: Widths of the student's hidden layers.
         activation: One of elu, gelu, relu, silu, tanh.
-        steps: Gradient steps; leave out where `epochs` is given.
-        epochs: Visits of each state; leave out where `steps` is given.
+        steps: Gradient steps of a round; leave out where `epochs` is given.
+        epochs: Visits of each state in a round; leave out where `steps` is given.
         batch_size: States in a minibatch.
         learning_rate: Peak learning rate of AdamW, with cosine decay to zero.
         weight_decay: Decoupled weight decay.
         weight: Weight of the derivative error. 0.5 holds the student to the expert's reaction to
             deviations of about half a standard deviation.
+        curvature_weight: Weight of the error of the second differences, with `order=2`.
+        max_gradient_norm: Scale longer gradients to this norm.
+        validation: Share of the episodes held out, by which the best weights are chosen.
+        patience: Validations (one each 100 steps) without a better one after which to stop.
         evaluation_episodes: Episodes of the paired evaluation.
         max_queries: Refuse to start a run that may ask the expert more often.
         force: Go on with a warning where the expert fails the gate but answers.
+        out: Folder of the run: checkpoints while it goes on, then all its files.
+        resume: Folder of a run that was interrupted; it goes on from its last checkpoint and ends
+            with the bytes of a run that never was.
+        log_formats: Some of stdout, log, csv, json, tensorboard: stable-baselines3's logger, into
+            the folder `log` of the run.
+        callback: Told of each 100 training steps, each round and the evaluation; see `Event`.
         progress: Show progress bars, where there is a terminal.
 
     Returns:
@@ -99,6 +132,7 @@ def distill(
         ExpertError: If the expert can't be opened or fails the gate, before anything is trained.
         EnvironmentFault: If the environment can't be used, or misbehaves.
         FitError: If training diverges.
+        StorageError: If the run's folder can't be written.
 
     Example:
         >>> result = distill(
@@ -108,71 +142,61 @@ def distill(
         >>> result.student.predict(result.demonstrations.observations[0])[0].shape
         (1,)
     """
-    defaults, source = preset_of(preset), Probes.parse(probes)
-    place, stages = pick_device(device), Stages(progress)
-    optimisation = defaults.fit_with(
+    given = None if demonstrations is None else load_dataset(demonstrations)
+    defaults = preset_of(preset)
+    settings = defaults.fit_with(
         steps=steps,
         epochs=epochs,
         batch_size=batch_size,
         learning_rate=learning_rate,
         weight_decay=weight_decay,
         weight=weight,
+        curvature_weight=curvature_weight,
+        max_gradient_norm=max_gradient_norm,
+        validation=validation,
+        patience=patience,
     )
-    with EnvironmentPool(env) as pool, torch_settings() as precision, noted_warnings() as notes:
-        n, m = pool.boxes.observation_size, pool.boxes.action_size
-        black_box = load_expert(expert, n, m, output=output, trust=trust)
+    source = source_of(defaults.complete(Probes.parse(probes)), order, given)
+    place = pick_device(device)
+    check_seed(seed)
+    with open_subject(expert, env, given, output=output, trust=trust) as subject:
         run = Configuration(
-            expert=str(expert) if isinstance(expert, (str, Path)) else black_box.name,
-            expert_sha256=black_box.sha256,
-            env=pool.name,
-            trainer=trainer_of(trainer),
-            probes=defaults.complete(source),
-            student=StudentShape(
-                n,
-                m,
-                defaults.hidden if hidden is None else tuple(hidden),
-                defaults.activation if activation is None else activation,
-            ),
-            fit=optimisation,
-            episodes=episodes,
-            horizon=resolve_horizon(horizon, pool),
-            seed=check_seed(seed),
+            expert=subject.expert_name,
+            expert_sha256=subject.expert.sha256 if subject.expert else None,
+            env=subject.environment,
+            trainer=None if given else trainer_of(trainer),
+            demonstrations=sha256(given.to_bytes()) if given else None,
+            states=len(given.demonstrations) if given else None,
+            probes=source,
+            probes_given=given is not None and given.answers is not None,
+            order=order if source else 0,
+            observation_size=subject.observation_size,
+            student_obs=describe_view(student_obs),
+            hidden=defaults.hidden if hidden is None else tuple(hidden),
+            activation=defaults.activation if activation is None else activation,
+            fit=settings,
+            episodes=check_count("episodes", episodes),
+            horizon=resolve_horizon(horizon, subject.pool) if subject.pool else 0,
+            seed=int(seed),
             device=device,
-            evaluation_episodes=evaluation_episodes,
+            evaluation_episodes=check_count("evaluation_episodes", evaluation_episodes)
+            if subject.comparable
+            else 0,
             max_queries=max_queries,
         )
         run.check_budget()
-        starts = episode_seeds(seed, "evaluation", 0, evaluation_episodes)
-        theirs = _gate(black_box, pool, starts, run.horizon, stages, force=force)
-        rounds, student, history = Rounds(black_box, pool, run.probes, seed, stages), None, []
-        started = time.perf_counter()
-        for round_, count in enumerate(run.trainer.rounds(episodes)):
-            rounds.collect(round_, count, run.trainer, student, run.horizon)
-            student, entries = rounds.train(round_, run.student, run.fit, place)
-            history += entries
-        train_seconds = time.perf_counter() - started
-        assert student is not None, "every trainer has a round"
-        evaluation = _compare(student.act, black_box, theirs, pool, run.horizon, seed, stages)
-        report = report_of(
-            run,
-            evaluation,
-            rounds,
-            steps=rounds.steps,
-            train_seconds=train_seconds,
-            matmul_precision=precision,
-            notes=notes,
-        )
-    settings = {**run.to_json(), "preset": preset, "force": force, "versions": report["versions"]}
-    return Distilled(
-        student,
-        evaluation,
-        history,
-        report["queries"],
-        settings,
-        report,
-        rounds.labelled,
-        rounds.answers,
-    )
+        place_of_run = out if resume is None else resume
+        folder = None if place_of_run is None else Path(place_of_run)
+        config = {**run.to_json(), "versions": versions()}
+        kept = RunFolder(folder, config, resume=resume is not None)
+        if folder and kept.finished and resume is not None:
+            return Distilled.load(folder)
+        told = tell_all(callback, log_formats, folder)
+        result = _go(run, subject, given, kept, student_obs, place, told, progress, force=force)
+    if folder:
+        result.save(folder)
+        kept.close()
+    return result
 
 
 def evaluate(
@@ -222,6 +246,62 @@ def evaluate(
         theirs = _gate(black_box, pool, starts, length, stages, force=force)
         answer = student.policy("evaluate")
         return _compare(answer, black_box, theirs, pool, length, seed, stages)
+
+
+def _go(
+    run: Configuration,
+    subject: Subject,
+    given: Dataset | None,
+    kept: RunFolder,
+    student_obs: StudentObservation | None,
+    device: torch.device,
+    told: Callback,
+    progress: bool,
+    *,
+    force: bool,
+) -> Distilled:
+    """Gate, rounds, comparison, report."""
+    stages, expert, pool = Stages(progress), subject.expert, subject.pool
+    with torch_settings() as precision, noted_warnings() as notes:
+        theirs = None
+        if expert is not None and pool is not None:
+            starts = episode_seeds(run.seed, "evaluation", 0, run.evaluation_episodes)
+            theirs = _gate(expert, pool, starts, run.horizon, stages, force=force)
+        started = time.perf_counter()
+        rounds = Rounds(run, expert, pool, student_obs, device, stages, kept, told, given)
+        rounds.all()
+        seconds = time.perf_counter() - started
+        student, evaluation = rounds.trained, None
+        if expert is not None and pool is not None and theirs is not None:
+            policy = rounds.view.policy(student.act)
+            evaluation = _compare(policy, expert, theirs, pool, run.horizon, run.seed, stages)
+            told(
+                Event(
+                    "evaluation",
+                    int(rounds.history[-1]["round"]),
+                    rounds.history[-1],
+                    student,
+                    evaluation,
+                )
+            )
+        report = report_of(
+            run,
+            evaluation,
+            rounds,
+            train_seconds=seconds,
+            matmul_precision=precision,
+            notes=notes,
+        )
+    return Distilled(
+        student,
+        evaluation,
+        rounds.history,
+        report["queries"],
+        {**run.to_json(), "versions": report["versions"]},
+        report,
+        rounds.data,
+        rounds.view,
+    )
 
 
 def _gate(

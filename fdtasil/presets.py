@@ -65,6 +65,10 @@ PRESETS = {
             weight_decay=0.01,
             epsilon=1e-8,
             weight=0.5,
+            curvature_weight=0.125,
+            max_gradient_norm=None,
+            validation=0.0,
+            patience=None,
         ),
     ),
     # TaSIL, appendices on experiments and finite differences. The weight multiplies the norm of
@@ -83,6 +87,10 @@ PRESETS = {
             weight_decay=0.01,
             epsilon=1e-4,
             weight=0.01,
+            curvature_weight=0.01,
+            max_gradient_norm=None,
+            validation=0.0,
+            patience=None,
         ),
     ),
 }

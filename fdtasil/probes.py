@@ -155,6 +155,8 @@ class Stencil:
         offsets: Multiples of the step at which the function is asked, the centre apart.
         weights: Weight of the value at each offset in the first difference.
         centre: Weight of the value at the centre, which is known already.
+        second: Weights of the values, and last that of the centre, in the second difference;
+            None where the stencil has none.
         exact: Whether the derivative is analytic, and no value is asked at all.
     """
 
@@ -162,11 +164,12 @@ class Stencil:
     offsets: tuple[float, ...]
     weights: tuple[float, ...]
     centre: float
+    second: tuple[float, ...] | None = None
     exact: bool = False
 
 
 FORWARD = Stencil("forward", (1.0,), (1.0,), -1.0)
-CENTRAL = Stencil("central", (1.0, -1.0), (0.5, -0.5), 0.0)
+CENTRAL = Stencil("central", (1.0, -1.0), (0.5, -0.5), 0.0, (1.0, 1.0, -2.0))
 EXACT = Stencil("exact", (), (), 0.0, exact=True)
 STENCILS = {stencil.name: stencil for stencil in (FORWARD, CENTRAL, EXACT)}
 
@@ -177,7 +180,8 @@ class Probes:
 
     Attributes:
         directions: Where.
-        stencil: How: `FORWARD`, `CENTRAL`, or `EXACT` (a differentiable expert only).
+        stencil: How: `FORWARD`, `CENTRAL`, or `EXACT` (a differentiable expert only). None is
+            forward for first order and central for second.
         radius: How far. Whitened space: standard deviations moved by each coordinate that moves
             (root mean square). Raw space: Euclidean length of the displacement.
             None leaves it to the preset.
@@ -197,7 +201,7 @@ class Probes:
     """
 
     directions: Directions
-    stencil: Stencil = FORWARD
+    stencil: Stencil | None = None
     radius: float | None = None
     space: Literal["whitened", "raw"] | None = None
     resample: bool = False
@@ -248,16 +252,31 @@ class Probes:
             name
             for name in DIRECTIONS
             if isinstance(self.directions, type(DIRECTIONS[name](1)))
-            and (name == "jacobian") == self.stencil.exact
+            and (name == "jacobian") == (self.stencil is EXACT)
         )
         count = getattr(self.directions, "probes", None)
         parts = [design if count is None else f"{design}:{count}"]
-        parts += [] if self.stencil.exact else [self.stencil.name]
+        parts += [self.stencil.name] if self.stencil not in (None, EXACT) else []
         parts += ["resample"] if self.resample else []
         parts += [self.space] if self.space else []
         parts += [f"radius={self.radius:g}"] if self.radius is not None else []
         parts += [f"per_step={self.per_step}"] if self.per_step is not None else []
         return ",".join(parts)
+
+    def with_order(self, order: int) -> "Probes":
+        """Return the source with a stencil that has differences up to `order`.
+
+        Raises:
+            SettingError: If the stencil that was asked for has none of second order.
+        """
+        stencil = self.stencil or (CENTRAL if order == 2 else FORWARD)
+        if order == 2 and not stencil.exact and stencil.second is None:
+            raise SettingError(
+                f"order=2 with the {stencil.name} stencil",
+                "a stencil with second differences",
+                'write probes="sphere:10,central"',
+            )
+        return replace(self, stencil=stencil)
 
     def queries(self, states: int, dimension: int, visits: int) -> int:
         """Return the rows that the expert is asked for.
@@ -269,7 +288,7 @@ class Probes:
         """
         count = self.directions.count(dimension)
         pools = self.pools(dimension, visits)
-        return pools * states * count * len(self.stencil.offsets)
+        return pools * states * count * len((self.stencil or FORWARD).offsets)
 
     def pools(self, dimension: int, visits: int) -> int:
         """Return how often the expert is asked for a new set of answers; see `queries`."""
@@ -296,7 +315,7 @@ def _parse_text(spec: str) -> Probes:
             f"probes={spec!r}: {match[1]} takes no count", _GRAMMAR, f'write "{match[1]}"'
         )
     directions = DIRECTIONS[match[1]](int(match[2]) if match[2] else None)
-    probes = Probes(directions, EXACT if match[1] == "jacobian" else FORWARD)
+    probes = Probes(directions, EXACT if match[1] == "jacobian" else None)
     for option in options:
         probes = replace(probes, **_parse_option(option, spec))
     return probes

@@ -2,6 +2,7 @@
 
 import platform
 import warnings
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib.metadata import version
@@ -24,10 +25,9 @@ def versions() -> dict[str, str]:
 
 def report_of(
     configuration: Configuration,
-    evaluation: Evaluation,
+    evaluation: Evaluation | None,
     rounds: Rounds,
     *,
-    steps: int,
     train_seconds: float,
     matmul_precision: str,
     notes: list[str],
@@ -36,33 +36,34 @@ def report_of(
 
     Args:
         configuration: The run's.
-        evaluation: Student against expert.
+        evaluation: Student against expert, or None where they could not be compared.
         rounds: After the last round.
-        steps: Gradient steps of all rounds.
         train_seconds: Wall-clock seconds of collecting, probing and training.
         matmul_precision: torch's float32 matrix-product precision in force.
         notes: Warnings on the way.
     """
     plain = configuration.to_json()
     probes, predicted = configuration.probes, configuration.predicted_queries()
+    asked = rounds.expert.queries if rounds.expert else Counter[str]()
     return {
         "expert": {
             "path": configuration.expert,
             "sha256": configuration.expert_sha256,
-            "return_mean": evaluation.expert_return,
+            "return_mean": evaluation.expert_return if evaluation else None,
         },
         **{name: plain[name] for name in ("env", "trainer", "probes", "seed")},
         "radius": probes.radius if probes else None,
         "versions": versions(),
-        "evaluation": evaluation.to_json(),
-        "queries": {name: rounds.expert.queries[name] for name in predicted},
+        "evaluation": evaluation.to_json() if evaluation else None,
+        "queries": {name: asked[name] for name in predicted},
         "predicted_queries": predicted,
-        "states": len(rounds.labelled),
-        "frozen_coordinates": rounds.frozen_coordinates,
+        "rows_asked_again_after_resuming": asked["again"],
+        "states": len(rounds.data.demonstrations),
+        "frozen_coordinates": int((~rounds.scales.live).sum()),
         "clipped_actions": rounds.counts["clipped_actions"],
         "physics_resets": rounds.counts["physics_resets"],
         "terminated_episodes": rounds.counts["terminated_episodes"],
-        "steps": steps,
+        "steps": rounds.steps,
         "train_seconds": round(train_seconds, 2),
         "matmul_precision": matmul_precision,
         "warnings": notes,

@@ -1,11 +1,17 @@
-"""One round of a run: collect, label, probe, fit."""
+"""The rounds of a run: collect, label, probe, fit; each stage is kept before the next begins."""
 
+import json
+import time
 from collections import Counter
-from dataclasses import dataclass, field
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 import torch
 
+from fdtasil.configuration import Configuration
+from fdtasil.datasets import Dataset
 from fdtasil.demonstrations import (
     Answers,
     Demonstrations,
@@ -15,123 +21,299 @@ from fdtasil.demonstrations import (
     statistics,
 )
 from fdtasil.environments import EnvironmentPool
+from fdtasil.errors import SettingError
+from fdtasil.events import Callback, Event
 from fdtasil.experts import Expert
-from fdtasil.fit import Fit, fit
-from fdtasil.probes import Probes
+from fdtasil.fit import Hooks, fit
+from fdtasil.fitstate import FitState
 from fdtasil.progress import Stages
 from fdtasil.rollouts import Behaviour, Episodes, rollout
+from fdtasil.runfolder import RunFolder
 from fdtasil.seeding import episode_seeds, generator, torch_generator
+from fdtasil.storage import to_json
 from fdtasil.student import Student, StudentShape
-from fdtasil.trainers import Situation, Trainer
+from fdtasil.trainers import Situation
+from fdtasil.views import StudentObservation, View
 
-__all__ = ["Rounds"]
+__all__ = ["CHECKPOINT_SECONDS", "Rounds"]
+
+CHECKPOINT_SECONDS = 20.0
+"""Time between two checkpoints inside a training; when they are taken changes no byte."""
 
 
 @dataclass
 class Rounds:
-    """What grows from round to round: demonstrations, answers, counts.
+    """What grows from round to round, and how it grows.
 
     Attributes:
-        expert: Who labels and answers probes.
-        pool: The environment.
-        probes: The derivative source, completed by the preset; None for plain cloning.
-        seed: The run's.
+        run: The configuration.
+        expert: Who labels and answers probes; None where nothing has to be asked.
+        pool: The environment; None where nothing has to be recorded.
+        student_obs: What the student sees; None for everything.
+        device: Where the student is trained.
         stages: Progress bars.
-        demonstrations: All labelled states so far; None before the first round.
-        scales: Of the observations of round 0, frozen.
-        answers: To the probes of all states so far.
+        folder: Where every stage is kept.
+        callback: Told of events.
+        dataset: All labelled states so far and the answers around them.
+        student: The last round's.
+        history: Entries of all rounds.
+        steps: Gradient steps of all rounds.
         episodes: Number of episodes recorded so far.
-        steps: Number of gradient steps so far.
         counts: Clipped actions, physics resets and falls of the recorded episodes.
+        again: Rows asked before a checkpoint was taken up, which the interrupted run has asked
+            and counted too; None in a run that was not interrupted.
     """
 
-    expert: Expert
-    pool: EnvironmentPool
-    probes: Probes | None
-    seed: int
+    run: Configuration
+    expert: Expert | None
+    pool: EnvironmentPool | None
+    student_obs: StudentObservation | None
+    device: torch.device
     stages: Stages
-    demonstrations: Demonstrations | None = None
-    scales: Statistics | None = None
-    answers: Answers | None = None
-    episodes: int = 0
+    folder: RunFolder
+    callback: Callback
+    dataset: Dataset | None = None
+    student: Student | None = None
+    history: list[dict[str, float]] = field(default_factory=list)
     steps: int = 0
+    episodes: int = 0
     counts: Counter[str] = field(default_factory=Counter)
+    again: int | None = None
 
-    def collect(
-        self, round_: int, count: int, trainer: Trainer, student: Student | None, horizon: int
-    ) -> None:
+    def all(self) -> None:
+        """Do every round, beginning where the folder's checkpoints end."""
+        counts = self.run.trainer.rounds(self.run.episodes) if self.run.trainer else [0]
+        for round_, count in enumerate(counts):
+            if not self._restore_collected(round_):
+                if self.run.trainer:
+                    self._collect(round_, count)
+                elif self.run.probes and not self.run.probes_given:
+                    self._probe_given()
+                self._keep_collected(round_)
+            if not self._restore_trained(round_):
+                self._train(round_)
+                self._keep_trained(round_)
+            self.callback(Event("round", round_, self.history[-1], self.student))
+
+    @property
+    def data(self) -> Dataset:
+        """The dataset; the first round has made it, or it was given."""
+        assert self.dataset is not None
+        return self.dataset
+
+    @property
+    def trained(self) -> Student:
+        """The last round's student."""
+        assert self.student is not None, "every run has a round"
+        return self.student
+
+    @property
+    def view(self) -> View:
+        """What the student sees."""
+        states = self.data.demonstrations
+        return View.of(self.student_obs, states.observations[states.round == 0][:256])
+
+    @property
+    def scales(self) -> Statistics:
+        """Scales of the states of round 0, which later rounds do not change."""
+        states = self.data.demonstrations
+        return statistics(states.observations[states.round == 0], self.view.seen)
+
+    def _collect(self, round_: int, count: int) -> None:
         """Record `count` episodes, label their states and ask the probes around them."""
+        expert, pool, trainer = self.expert, self.pool, self.run.trainer
+        assert expert is not None
+        assert pool is not None
+        assert trainer is not None
 
         def record_extra(behaviour: Behaviour, extra: int) -> Episodes:
-            return self._record(behaviour, f"extra {round_}", 0, extra, horizon)
+            return self._record(pool, behaviour, f"extra {round_}", 0, extra)
 
-        policy = student.act if student else None
-        situation = Situation(round_, self.expert, policy, record_extra)
+        policy = self.view.policy(self.student.act) if self.student else None
+        behaviour = trainer.behaviour(Situation(round_, expert, policy, record_extra))
         first = self.episodes
-        recorded = self._record(trainer.behaviour(situation), "rollout", first, count, horizon)
-        new = label(recorded, self.expert, first, round_)
+        recorded = self._record(pool, behaviour, "rollout", first, count)
+        new = label(recorded, expert, first, round_)
         self.episodes += count
         self.counts["clipped_actions"] += recorded.clipped_actions
         self.counts["physics_resets"] += recorded.physics_resets
         self.counts["terminated_episodes"] += int(recorded.terminated.sum())
-        self.demonstrations = self.demonstrations + new if self.demonstrations else new
-        self.scales = self.scales or statistics(new.observations)
-        if self.probes is not None:
-            answers = self._ask(new.observations, self.episodes, 0)
-            self.answers = self.answers + answers if self.answers else answers
+        bounds = pool.boxes.low, pool.boxes.high
+        before, old = self.dataset, None
+        self.dataset = Dataset(new, None, None, *bounds, pool.name)
+        if before is not None:
+            self.dataset = replace(before, demonstrations=before.demonstrations + new)
+            old = before.answers
+        if self.run.probes is not None:
+            answers = self._ask(new.observations, round_, 0)
+            answers = old + answers if old is not None else answers
+            self.dataset = replace(self.dataset, probes=self.run.probes, answers=answers)
+
+    def _probe_given(self) -> None:
+        """Ask the probes around given states."""
+        answers = self._ask(self.data.demonstrations.observations, 0, 0)
+        self.dataset = replace(self.data, probes=self.run.probes, answers=answers)
 
     def _record(
-        self, behaviour: Behaviour, stream: str, first: int, count: int, horizon: int
+        self, pool: EnvironmentPool, behaviour: Behaviour, stream: str, first: int, count: int
     ) -> Episodes:
-        numbers = range(first, first + count)
-        noise = [generator(self.seed, f"{stream} noise", episode) for episode in numbers]
-        seeds = episode_seeds(self.seed, stream, first, count)
+        numbers, horizon = range(first, first + count), self.run.horizon
+        noise = [generator(self.run.seed, f"{stream} noise", episode) for episode in numbers]
+        seeds = episode_seeds(self.run.seed, stream, first, count)
         with self.stages.stage("demonstrations", count * horizon, "step") as move:
-            return rollout(behaviour, self.pool, seeds, horizon, noise, move)
-
-    def train(
-        self, round_: int, shape: StudentShape, settings: Fit, device: torch.device
-    ) -> tuple[Student, list[dict[str, float]]]:
-        """Train a fresh student on all demonstrations; return it with its history."""
-        assert self.scales is not None, "collect comes first"
-        bounds = self.pool.boxes.low, self.pool.boxes.high
-        random = torch_generator(self.seed, "student", round_)
-        student = Student(shape, self.scales.mean, self.scales.scale, *bounds, random).to(device)
-        total = settings.total_steps(len(self.labelled))
-        self.steps += total
-        with self.stages.stage(f"training, round {round_}", total, "step") as move:
-            entries = fit(
-                student,
-                self.labelled,
-                self.probes,
-                self._pool_of_answers if self.probes else None,
-                settings,
-                torch_generator(self.seed, "batches", round_),
-                move,
-            )
-        return student.cpu(), [{"round": round_, **entry} for entry in entries]
-
-    @property
-    def labelled(self) -> Demonstrations:
-        """All labelled states; `collect` comes first."""
-        assert self.demonstrations is not None, "collect comes first"
-        return self.demonstrations
-
-    @property
-    def frozen_coordinates(self) -> int:
-        """Number of coordinates that did not move in round 0."""
-        assert self.scales is not None, "collect comes first"
-        return int((~self.scales.live).sum())
-
-    def _pool_of_answers(self, number: int) -> Answers:
-        """Return the stored answers, or for a later number those of new directions."""
-        if number == 0:
-            assert self.answers is not None, "collect comes first"
-            return self.answers
-        return self._ask(self.labelled.observations, self.episodes, number)
+            return rollout(behaviour, pool, seeds, horizon, noise, move)
 
     def _ask(self, observations: np.ndarray, *path: int) -> Answers:
-        assert self.probes is not None
-        assert self.scales is not None
-        random = generator(self.seed, "probes", *path)
-        return ask_probes(self.expert, observations, self.probes, self.scales, random)
+        probes, expert = self.run.probes, self.expert
+        assert probes is not None
+        if expert is None:
+            raise SettingError(
+                f"probes={probes.describe()!r} without an expert to ask",
+                "an expert, or demonstrations with stored answers",
+                "pass the expert, or probes=0 for plain behaviour cloning",
+            )
+        random = generator(self.run.seed, "probes", *path)
+        return ask_probes(expert, observations, probes, self.scales, random, self.run.order)
+
+    def _train(self, round_: int) -> None:
+        """Train a fresh student on all demonstrations, as it sees them."""
+        run, view, data = self.run, self.view, self.data
+        seen = view.demonstrations(data.demonstrations)
+        scales = statistics(seen.observations[seen.round == 0])
+        shape = StudentShape(view.size, seen.actions.shape[1], run.hidden, run.activation)
+        start = torch_generator(run.seed, "student", round_)
+        student = Student(shape, scales.mean, scales.scale, data.low, data.high, start)
+        saved = self.folder.load(round_, "training")
+        resume = None
+        asked_pool = -1
+        if saved is not None and self.expert is not None:
+            state = json.loads(saved["state.json"])
+            asked_pool = state["pool"]
+            self._restore_ledger(state["queries"])
+        if saved is not None:
+            resume = saved["fit.safetensors"]
+        pools = _Pools(self, view, seen, round_, asked_pool)
+        total = run.fit.total_steps(len(seen))
+        with self.stages.stage(f"training, round {round_}", total, "step") as move:
+            hooks = Hooks(self._tell(round_, move), self._checkpoint(round_, pools))
+            entries = fit(
+                student.to(self.device),
+                seen,
+                run.probes,
+                pools if run.probes else None,
+                run.fit,
+                lambda name: torch_generator(run.seed, "batches", round_, name),
+                order=run.order,
+                hooks=hooks,
+                resume=resume,
+            )
+        self.student = student.cpu()
+        self.steps += int(entries[-1]["step"])
+        self.history += [{"round": round_, **entry} for entry in entries]
+
+    def _tell(
+        self, round_: int, move: Callable[[int], None]
+    ) -> Callable[[dict[str, float]], None]:
+        last = 0
+
+        def tell(entry: dict[str, float]) -> None:
+            nonlocal last
+            move(int(entry["step"]) - last)
+            last = int(entry["step"])
+            self.callback(Event("entry", round_, {"round": round_, **entry}))
+
+        return tell
+
+    def _checkpoint(self, round_: int, pools: "_Pools") -> Callable[[FitState], None]:
+        due = time.monotonic() + CHECKPOINT_SECONDS
+
+        def checkpoint(state: FitState) -> None:
+            nonlocal due
+            if time.monotonic() < due:
+                return
+            about = {"pool": pools.number, "queries": self._ledger()}
+            files = {"fit.safetensors": state.to_bytes(), "state.json": to_json(about)}
+            self.folder.save(round_, "training", state.step, files)
+            due = time.monotonic() + CHECKPOINT_SECONDS
+
+        return checkpoint
+
+    # --- what is kept
+
+    def _ledger(self) -> dict[str, int]:
+        return dict(self.expert.queries) if self.expert else {}
+
+    def _restore_ledger(self, queries: dict[str, int]) -> None:
+        """Take the ledger of the interrupted run; what this one asked before counts as again."""
+        if self.expert is None:
+            return
+        if self.again is None:
+            self.again = sum(self.expert.queries.values())
+        self.expert.queries.clear()
+        self.expert.queries.update(queries)
+        self.expert.queries["again"] += self.again
+
+    def _keep_collected(self, round_: int) -> None:
+        about = {"episodes": self.episodes, "counts": self.counts, "queries": self._ledger()}
+        files = {"demonstrations.npz": self.data.to_bytes(), "state.json": to_json(about)}
+        self.folder.save(round_, "collected", 0, files)
+
+    def _restore_collected(self, round_: int) -> bool:
+        files = self.folder.load(round_, "collected")
+        if files is None:
+            return False
+        state: dict[str, Any] = json.loads(files["state.json"])
+        self.dataset = Dataset.from_bytes(files["demonstrations.npz"])
+        self.episodes, self.counts = state["episodes"], Counter(state["counts"])
+        self._restore_ledger(state["queries"])
+        return True
+
+    def _keep_trained(self, round_: int) -> None:
+        about = {"history": self.history, "steps": self.steps, "queries": self._ledger()}
+        files = {"student.safetensors": self.trained.to_bytes(), "state.json": to_json(about)}
+        self.folder.save(round_, "trained", 0, files)
+
+    def _restore_trained(self, round_: int) -> bool:
+        files = self.folder.load(round_, "trained")
+        if files is None:
+            return False
+        state: dict[str, Any] = json.loads(files["state.json"])
+        self.student = Student.from_bytes(files["student.safetensors"])
+        self.history, self.steps = state["history"], state["steps"]
+        self._restore_ledger(state["queries"])
+        return True
+
+
+class _Pools:
+    """The expert's answers by number of the pool: those stored, then those of new directions."""
+
+    def __init__(
+        self, rounds: Rounds, view: View, seen: Demonstrations, round_: int, asked: int
+    ) -> None:
+        self._rounds, self._view, self._seen = rounds, view, seen
+        self._round, self._asked_before = round_, asked
+        self.number = 0
+
+    def __call__(self, number: int) -> Answers:
+        rounds, data = self._rounds, self._rounds.data
+        observations = data.demonstrations.observations
+        probes = rounds.run.probes
+        assert probes is not None
+        assert probes.stencil is not None
+        if number == 0:
+            assert data.answers is not None
+            answers = data.answers
+        else:
+            answers = self._ask(observations, number)
+        self.number = number
+        return self._view.answers(answers, observations, probes.stencil.offsets)
+
+    def _ask(self, observations: np.ndarray, number: int) -> Answers:
+        answers = self._rounds._ask(observations, self._round, number)
+        expert = self._rounds.expert
+        if number == self._asked_before and expert is not None:
+            # The interrupted run has asked and counted these.
+            rows = answers.values.shape[0] * answers.values.shape[1] * answers.values.shape[2]
+            expert.queries["probe"] -= rows
+            expert.queries["again"] += rows
+        return answers

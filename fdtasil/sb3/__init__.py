@@ -8,5 +8,6 @@ and what has to be known besides (class names, the activation, the action bounds
 
 from fdtasil.sb3.agent import Agent, Trust, read_agent
 from fdtasil.sb3.export import export_sb3
+from fdtasil.sb3.logging import open_log
 
-__all__ = ["Agent", "Trust", "export_sb3", "read_agent"]
+__all__ = ["Agent", "Trust", "export_sb3", "open_log", "read_agent"]

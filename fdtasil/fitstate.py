@@ -1,0 +1,124 @@
+"""Where a training stands: what it needs to go on with the same bytes."""
+
+import json
+import math
+
+import safetensors.torch
+import torch
+from torch import Tensor, nn
+
+from fdtasil.errors import StorageError
+
+__all__ = ["FitState"]
+
+_TERMS = ("loss", "action_error", "derivative_error", "curvature_error")
+
+
+class FitState:
+    """Weights, optimiser, history and best weights of a training.
+
+    Args:
+        student: The student in training.
+        optimiser: Its AdamW.
+
+    Attributes:
+        step: Gradient steps done.
+        history: Entries so far.
+        stale: Validations since the best one.
+    """
+
+    def __init__(self, student: nn.Module, optimiser: torch.optim.Optimizer) -> None:
+        self._student, self._optimiser = student, optimiser
+        self.step = 0
+        self.history: list[dict[str, float]] = []
+        self.stale = 0
+        self._recent: list[Tensor] = []
+        self._best_loss = math.inf
+        self._best: dict[str, Tensor] = {}
+
+    def count(self, losses: Tensor) -> None:
+        """Count one step and its (4,) losses."""
+        self.step += 1
+        self._recent.append(losses)
+
+    def log(self, held_out: float | None) -> dict[str, float]:
+        """Make an entry of the steps since the last one, and keep the weights if they are best."""
+        means = torch.stack(self._recent).mean(dim=0).tolist()
+        self._recent = []
+        entry: dict[str, float] = {"step": self.step, **dict(zip(_TERMS, means, strict=True))}
+        entry["validation_loss"] = entry["loss"] if held_out is None else held_out
+        if held_out is not None:
+            self.stale += 1
+            if held_out < self._best_loss:
+                self.stale, self._best_loss = 0, held_out
+                self._best = {k: v.clone() for k, v in self._student.state_dict().items()}
+        self.history.append(entry)
+        return entry
+
+    def keep_best(self) -> None:
+        """Put the best validated weights back, if there are any."""
+        if self._best:
+            self._student.load_state_dict(self._best)
+
+    def to_bytes(self) -> bytes:
+        """Return the state as a safetensors file."""
+        groups = {
+            "student": self._student.state_dict(),
+            "best": self._best,
+            "recent": {"losses": torch.stack(self._recent)} if self._recent else {},
+        }
+        for number, moments in self._optimiser.state_dict()["state"].items():
+            groups[f"optimiser.{number}"] = moments
+        tensors = {
+            f"{group}/{name}": tensor.detach().cpu().contiguous().clone()
+            for group, members in groups.items()
+            for name, tensor in members.items()
+        }
+        numbers = {
+            "step": self.step,
+            "stale": self.stale,
+            "best_loss": None if math.isinf(self._best_loss) else self._best_loss,
+            "history": self.history,
+        }
+        return safetensors.torch.save(tensors, {"fit": json.dumps(numbers)})
+
+    def restore(self, data: bytes) -> None:
+        """Take over the state that `to_bytes` wrote.
+
+        Raises:
+            StorageError: If it is not such a state, or of another student.
+        """
+        try:
+            tensors = safetensors.torch.load(data)
+            size = int.from_bytes(data[:8], "little")
+            numbers = json.loads(json.loads(data[8 : 8 + size])["__metadata__"]["fit"])
+            self._student.load_state_dict(_group(tensors, "student"))
+            self._load_moments(tensors)
+        except (safetensors.SafetensorError, KeyError, ValueError, RuntimeError) as error:
+            raise StorageError(
+                f"not the state of this training: {error}".splitlines()[0],
+                "a checkpoint of the same run",
+                "start the run anew in another folder",
+            ) from error
+        self.step, self.stale = numbers["step"], numbers["stale"]
+        self.history = numbers["history"]
+        best = numbers["best_loss"]
+        self._best_loss = math.inf if best is None else best
+        device = next(self._student.parameters()).device
+        self._best = {k: v.to(device) for k, v in _group(tensors, "best").items()}
+        recent = _group(tensors, "recent").get("losses")
+        self._recent = [] if recent is None else list(recent.to(device))
+
+    def _load_moments(self, tensors: dict[str, Tensor]) -> None:
+        whole = self._optimiser.state_dict()
+        numbers = whole["param_groups"][0]["params"]
+        whole["state"] = {number: _group(tensors, f"optimiser.{number}") for number in numbers}
+        self._optimiser.load_state_dict(whole)
+
+
+def _group(tensors: dict[str, Tensor], name: str) -> dict[str, Tensor]:
+    return {
+        key.removeprefix(f"{name}/"): tensor
+        for key, tensor in tensors.items()
+        if key.startswith(f"{name}/")
+    }

@@ -1,0 +1,131 @@
+"""A run's folder while the run goes on: its configuration, its checkpoints, and going on."""
+
+import json
+import shutil
+import warnings
+from pathlib import Path
+from typing import Any
+
+from fdtasil.errors import FdtasilWarning, SettingError, StorageError
+from fdtasil.storage import MANIFEST, to_json, verify, write_bytes, write_folder
+
+__all__ = ["RunFolder"]
+
+_CONFIG = "config.json"
+_CHECKPOINTS = "checkpoints"
+
+
+class RunFolder:
+    """Where a run keeps what it must not lose. Without a path it keeps nothing.
+
+    Checkpoints are folders `checkpoints/<round>/<stage>-<number>/`, each with a manifest as its
+    last file: one that has none, or does not verify, never counts.
+
+    Args:
+        path: The folder, or None.
+        config: The run's configuration as plain JSON, with versions.
+        resume: Whether the folder holds this run's beginning.
+
+    Raises:
+        SettingError: If there is nothing to resume, the folder's run has another configuration,
+            or a new run would overwrite an unfinished one.
+        StorageError: If the folder can't be written.
+    """
+
+    def __init__(self, path: Path | None, config: dict[str, Any], *, resume: bool) -> None:
+        self._path = path
+        if path is None:
+            return
+        if resume:
+            _check_same(_read_config(path), config, path)
+            return
+        if (path / _CHECKPOINTS).exists():
+            raise SettingError(
+                f"{path} holds an unfinished run",
+                "an empty folder, or a finished run (which is replaced)",
+                f'resume="{path}" (--resume {path}) to go on, or remove the folder',
+            )
+        # Not beside the files of a finished run, which stay whole until this one is saved.
+        write_bytes(path / _CHECKPOINTS / _CONFIG, to_json(config))
+
+    @property
+    def finished(self) -> bool:
+        """Whether the folder holds a finished run."""
+        if self._path is None or (self._path / _CHECKPOINTS).exists():
+            return False
+        return (self._path / MANIFEST).exists()
+
+    def save(self, round_: int, stage: str, number: int, files: dict[str, bytes]) -> None:
+        """Write a checkpoint, then drop the older ones of its stage."""
+        if self._path is None:
+            return
+        place = self._path / _CHECKPOINTS / str(round_)
+        write_folder(place / f"{stage}-{number}", files)
+        for older in _numbered(place, stage):
+            if older.name != f"{stage}-{number}":
+                shutil.rmtree(older, ignore_errors=True)
+
+    def load(self, round_: int, stage: str) -> dict[str, bytes] | None:
+        """Return the newest whole checkpoint of a stage, or None."""
+        if self._path is None:
+            return None
+        for folder in _numbered(self._path / _CHECKPOINTS / str(round_), stage):
+            if not (folder / MANIFEST).exists():
+                continue  # the run ended while it was written
+            try:
+                return verify(folder)
+            except StorageError as error:
+                message = f"{error.found}: an earlier checkpoint is used"
+                warnings.warn(message, FdtasilWarning, stacklevel=2)
+        return None
+
+    def close(self) -> None:
+        """Drop the checkpoints of a run that is saved."""
+        if self._path is not None:
+            shutil.rmtree(self._path / _CHECKPOINTS, ignore_errors=True)
+
+
+def _read_config(path: Path) -> dict[str, Any]:
+    unfinished, finished = path / _CHECKPOINTS / _CONFIG, path / _CONFIG
+    try:
+        return json.loads((unfinished if unfinished.exists() else finished).read_bytes())
+    except (OSError, ValueError) as error:
+        raise SettingError(
+            f"{path} holds no run to resume ({type(error).__name__})",
+            f"a folder with a {_CONFIG}",
+            "check the path, or start the run with out= (--out)",
+        ) from error
+
+
+def _check_same(before: dict[str, Any], now: dict[str, Any], path: Path) -> None:
+    changed = _differences(before, now)
+    versions = [change for change in changed if change.startswith("versions.")]
+    settings = [change for change in changed if not change.startswith("versions.")]
+    if settings:
+        shown = "; ".join(settings[:8]) + (f"; and {len(settings) - 8} more" * (len(settings) > 8))
+        raise SettingError(
+            f"{path} was begun with another configuration: {shown}",
+            "the same arguments as at the beginning",
+            "repeat them, or start anew in another folder",
+        )
+    if versions:
+        message = f"resumed with other versions, so bytes may differ: {'; '.join(versions)}"
+        warnings.warn(message, FdtasilWarning, stacklevel=4)
+
+
+def _differences(before: Any, now: Any, name: str = "") -> list[str]:
+    if isinstance(before, dict) and isinstance(now, dict):
+        return [
+            change
+            for key in sorted({*before, *now})
+            for change in _differences(
+                before.get(key), now.get(key), f"{name}.{key}" if name else key
+            )
+        ]
+    return [] if before == now else [f"{name} was {before!r}, is {now!r}"]
+
+
+def _numbered(place: Path, stage: str) -> list[Path]:
+    """Return the folders of a stage, the newest first."""
+    found = [folder for folder in place.glob(f"{stage}-*") if folder.name[-1].isdigit()]
+    return sorted(found, key=lambda folder: -int(folder.name.rpartition("-")[2]))
