@@ -203,7 +203,7 @@ def _shell_parameter(
     default = str(parameter.default) if parameter.name == "probes" else parameter.default
     if get_origin(kind) in (Union, UnionType) and NoneType in get_args(kind):
         # tyro would show "{None}|INT"; leaving the argument out is how a shell says None.
-        (inner,) = (one for one in get_args(kind) if one is not NoneType)
+        inner = next(one for one in get_args(kind) if one is not NoneType)
         metavar = _METAVARS.get(get_origin(inner) or inner, "TEXT")
         kind = Annotated[kind, tyro.conf.arg(metavar=metavar)]
     return parameter.replace(annotation=kind, default=default, kind=inspect.Parameter.KEYWORD_ONLY)

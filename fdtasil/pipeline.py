@@ -24,6 +24,7 @@ from fdtasil.runfolder import RunFolder
 from fdtasil.sb3 import Trust
 from fdtasil.seeding import check_seed, episode_seeds
 from fdtasil.storage import sha256
+from fdtasil.student import check_shape
 from fdtasil.subject import Subject, open_subject, source_of
 from fdtasil.trainers import Trainer, trainer_of
 from fdtasil.views import StudentObservation, describe_view
@@ -159,6 +160,7 @@ def distill(
     source = source_of(defaults.complete(Probes.parse(probes)), order, given)
     place = pick_device(device)
     check_seed(seed)
+    check_shape(hidden or (), activation or defaults.activation)
     with open_subject(expert, env, given, output=output, trust=trust) as subject:
         run = Configuration(
             expert=subject.expert_name,

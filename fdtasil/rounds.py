@@ -115,9 +115,13 @@ class Rounds:
 
     @property
     def scales(self) -> Statistics:
-        """Scales of the states of round 0, which later rounds do not change."""
+        """Scales of all states so far; which coordinates are probed is settled in round 0.
+
+        An expert may fall in the first episode, and a few states tell little of the scales.
+        """
         states = self.data.demonstrations
-        return statistics(states.observations[states.round == 0], self.view.seen)
+        first = statistics(states.observations[states.round == 0])
+        return replace(statistics(states.observations, self.view.seen), live=first.live)
 
     def _collect(self, round_: int, count: int) -> None:
         """Record `count` episodes, label their states and ask the probes around them."""
@@ -179,7 +183,7 @@ class Rounds:
         """Train a fresh student on all demonstrations, as it sees them."""
         run, view, data = self.run, self.view, self.data
         seen = view.demonstrations(data.demonstrations)
-        scales = statistics(seen.observations[seen.round == 0])
+        scales = statistics(seen.observations)
         shape = StudentShape(view.size, seen.actions.shape[1], run.hidden, run.activation)
         start = torch_generator(run.seed, "student", round_)
         student = Student(shape, scales.mean, scales.scale, data.low, data.high, start)

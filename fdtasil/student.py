@@ -1,7 +1,7 @@
 """The policy that is kept: normalise, MLP, action bounds; its own files."""
 
 import json
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 
@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from fdtasil.errors import SettingError, StorageError
 
-__all__ = ["ACTIVATIONS", "Student", "StudentShape"]
+__all__ = ["ACTIVATIONS", "Student", "StudentShape", "check_shape"]
 
 ACTIVATIONS: dict[str, Callable[[], nn.Module]] = {
     "elu": nn.ELU,
@@ -40,18 +40,23 @@ class StudentShape:
     activation: str
 
     def __post_init__(self) -> None:
-        if self.activation not in ACTIVATIONS:
-            raise SettingError(
-                f"activation={self.activation!r}",
-                f"one of {', '.join(ACTIVATIONS)}",
-                'write for example activation="gelu"',
-            )
-        if not all(isinstance(width, int) and width > 0 for width in self.hidden):
-            raise SettingError(
-                f"hidden={self.hidden!r}",
-                "positive integers",
-                "write for example hidden=(256, 256)",
-            )
+        check_shape(self.hidden, self.activation)
+
+
+def check_shape(hidden: Sequence[int], activation: str) -> None:
+    """Check what a caller says of a network.
+
+    Raises:
+        SettingError: If a width is not a positive integer, or the activation is unknown.
+    """
+    if activation not in ACTIVATIONS:
+        raise SettingError(
+            f"activation={activation!r}",
+            f"one of {', '.join(ACTIVATIONS)}",
+            'write for example activation="gelu"',
+        )
+    if not all(isinstance(width, int) and width > 0 for width in hidden):
+        raise SettingError(f"hidden={hidden!r}", "positive integers", "write (256, 256)")
 
 
 class Student(nn.Module):

@@ -85,7 +85,7 @@ def test_chunks_do_not_change_the_answers(chunk, tmp_path, rows):
 
 
 def test_a_linear_experts_jacobian_is_exact(rows):
-    probes = PRESETS["standard"].complete(Probes.parse("basis"))
+    probes = PRESETS["standard"].complete(Probes.parse("basis")).with_order(1)
     expert, scales = load_expert(lambda x: x @ GAIN.T), statistics(rows)
     answers = ask_probes(expert, rows, probes, scales, np.random.default_rng(0))
     steps = answers.displacements.sum(axis=1)
@@ -226,7 +226,7 @@ def test_the_twin_agrees_and_is_differentiable(tmp_path, rows):
     found = ask_probes(
         expert,
         rows,
-        PRESETS["standard"].complete(Probes.parse("jacobian")),
+        PRESETS["standard"].complete(Probes.parse("jacobian")).with_order(1),
         statistics(rows),
         np.random.default_rng(0),
     )
@@ -237,7 +237,7 @@ def test_the_twin_agrees_and_is_differentiable(tmp_path, rows):
 def test_a_graph_without_a_twin_says_so(tmp_path, rows):
     expert = load_expert(mlp_onnx(tmp_path / "e.onnx", reshape_to=[-1, 5]), 5, 2)
     assert expert.module is None
-    probes = PRESETS["standard"].complete(Probes.parse("jacobian"))
+    probes = PRESETS["standard"].complete(Probes.parse("jacobian")).with_order(1)
     with pytest.raises(ExpertError, match="can't be differentiated"):
         ask_probes(expert, rows, probes, statistics(rows), np.random.default_rng(0))
 

@@ -32,13 +32,17 @@ def linear_task(states=200, n=6, m=2, spec=None):
     )
     if spec is None:
         return demonstrations, None, None
-    probes = STANDARD.complete(Probes.parse(spec))
+    probes = STANDARD.complete(Probes.parse(spec)).with_order(1)
     scales = statistics(observations)
 
     def ask(pool):
         return ask_probes(expert, observations, probes, scales, np.random.default_rng(pool))
 
     return demonstrations, probes, ask
+
+
+def stream(name):
+    return torch_generator(0, name)
 
 
 def new_student(n=6, m=2, hidden=(32,)):
@@ -51,7 +55,7 @@ def train(spec=None, student=None, **changes):
     demonstrations, probes, ask = linear_task(spec=spec)
     student = student or new_student()
     settings = replace(STANDARD.fit, **{"steps": 300, **changes})
-    history = fit(student, demonstrations, probes, ask, settings, torch_generator(0))
+    history = fit(student, demonstrations, probes, ask, settings, stream)
     return student, history
 
 
@@ -70,7 +74,7 @@ def test_probes_teach_the_derivative():
     errors = {}
     for name, source in {"cloning": None, "probes": probes}.items():
         student = new_student()
-        fit(student, demonstrations, source, ask if source else None, settings, torch_generator(0))
+        fit(student, demonstrations, source, ask if source else None, settings, stream)
         fresh = ask(99)
         points = demonstrations.observations[:, None] + fresh.displacements[fresh.numbers]
         answers = student.act(points.reshape(-1, 6)).reshape(fresh.values[:, :, 0].shape)
@@ -88,7 +92,7 @@ def test_the_cost_of_a_step_does_not_grow_with_the_stored_probes():
             student = new_student(**sizes, hidden=(512, 512))
             settings = replace(STANDARD.fit, steps=60)
             start = time.process_time()
-            fit(student, demonstrations, probes, ask, settings, torch_generator(0))
+            fit(student, demonstrations, probes, ask, settings, stream)
             cost[spec] = min(cost.get(spec, np.inf), time.process_time() - start)
     assert cost["50"] / cost[None] < 3
 
@@ -96,10 +100,10 @@ def test_the_cost_of_a_step_does_not_grow_with_the_stored_probes():
 def test_every_epoch_visits_each_state_once_and_every_probe_comes_up():
     demonstrations, probes, ask = linear_task(states=50, spec="5")
     answers = ask(0)
-    batches = Batches(demonstrations, probes, ask, torch_generator(0), torch.device("cpu"))
+    batches = Batches(demonstrations, probes, ask, stream, torch.device("cpu"))
     seen = []
     for epoch in range(5):
-        dealt = list(batches.epoch(epoch, 4))
+        dealt = list(batches.epoch(epoch, torch.arange(50), 4))
         states = torch.cat([batch.observations for batch in dealt]).numpy()
         assert np.array_equal(
             np.sort(states, axis=0), np.sort(demonstrations.observations, axis=0)
@@ -121,7 +125,7 @@ def test_the_expert_is_asked_as_often_as_predicted(spec, pools):
         return ask(pool)
 
     settings = replace(STANDARD.fit, steps=20, batch_size=25)
-    fit(new_student(), demonstrations, probes, counted, settings, torch_generator(0))
+    fit(new_student(), demonstrations, probes, counted, settings, stream)
     visits = settings.visits(50)
     assert visits == 10
     assert asked == list(range(pools))
@@ -131,7 +135,7 @@ def test_the_expert_is_asked_as_often_as_predicted(spec, pools):
 def test_fewer_states_than_a_batch():
     demonstrations, _, _ = linear_task(states=7)
     settings = replace(STANDARD.fit, steps=5)
-    history = fit(new_student(), demonstrations, None, None, settings, torch_generator(0))
+    history = fit(new_student(), demonstrations, None, None, settings, stream)
     assert history[-1]["step"] == 5
 
 
@@ -139,7 +143,7 @@ def test_a_loss_that_is_not_finite_stops_the_training():
     demonstrations, _, _ = linear_task()
     demonstrations.actions[3, 0] = np.nan
     with pytest.raises(FitError, match="the loss became nan"):
-        fit(new_student(), demonstrations, None, None, STANDARD.fit, torch_generator(0))
+        fit(new_student(), demonstrations, None, None, STANDARD.fit, stream)
 
 
 def test_equal_seeds_give_equal_weights():

@@ -6,7 +6,7 @@ import torch
 
 from fdtasil.demonstrations import ask_probes, statistics
 from fdtasil.experts import load_expert
-from fdtasil.loss import Minibatch, taylor_loss
+from fdtasil.loss import Minibatch, Weights, taylor_loss
 from fdtasil.presets import PRESETS
 from fdtasil.probes import Probes
 from fdtasil.student import Student, StudentShape
@@ -19,11 +19,12 @@ def smooth_expert(n=6, m=3):
     return Student(shape, zeros, ones, -np.ones(m), np.ones(m), random).eval()
 
 
-def batch_of(module, spec, states):
+def batch_of(module, spec, states, order=1):
     """The whole stencil of every state, and the stencil's gain."""
-    probes = PRESETS["standard"].complete(Probes.parse(spec))
+    probes = PRESETS["standard"].complete(Probes.parse(spec)).with_order(order)
     expert = load_expert(module)
-    answers = ask_probes(expert, states, probes, statistics(states), np.random.default_rng(0))
+    random = np.random.default_rng(0)
+    answers = ask_probes(expert, states, probes, statistics(states), random, order)
     batch = Minibatch(
         torch.from_numpy(states),
         torch.from_numpy(expert.ask(states, "label")),
@@ -42,7 +43,7 @@ def states():
 def test_the_loss_is_zero_at_the_expert(states, spec):
     expert = smooth_expert()
     batch, stencil, gain = batch_of(expert, spec, states)
-    loss = taylor_loss(expert, batch, stencil, 0.5, gain)
+    loss = taylor_loss(expert, batch, stencil, Weights(0.5), gain)
     assert float(loss.total) < 1e-4
 
 
@@ -56,7 +57,7 @@ def test_the_analytic_loss_and_gradient_agree_with_the_differences(states):
     for spec in ("basis,central,radius=0.02", "jacobian"):
         student.zero_grad()
         batch, stencil, gain = batch_of(expert, spec, states)
-        loss = taylor_loss(student, batch, stencil, 0.5, gain)
+        loss = taylor_loss(student, batch, stencil, Weights(0.5), gain)
         loss.total.backward()
         gradient = torch.cat([p.grad.flatten() for p in student.parameters()])
         found[spec] = loss.total.detach(), gradient
@@ -73,8 +74,46 @@ def test_a_linear_difference_is_the_exact_derivative(states):
     expected = float((matrix.weight * torch.from_numpy(states.std(axis=0))).norm())
     for spec in ("basis", "basis,central,radius=3", "orthogonal:6,radius=1", "jacobian"):
         batch, stencil, gain = batch_of(matrix, spec, states)
-        loss = taylor_loss(lambda x: 0 * x[:, :3], batch, stencil, 1.0, gain)
+        loss = taylor_loss(lambda x: 0 * x[:, :3], batch, stencil, Weights(1.0), gain)
         assert float(loss.derivative) == pytest.approx(expected, rel=1e-4), spec
+
+
+def test_second_differences_agree_with_exact_second_derivatives():
+    """Ten inputs, the same directions: central differences against the analytic reference."""
+    states = np.random.default_rng(0).standard_normal((40, 10)).astype(np.float32)
+    expert, student = smooth_expert(10), smooth_expert(10)
+    with torch.no_grad():
+        for parameter in student.parameters():
+            parameter.mul_(0.8)
+    found = {}
+    for spec in ("orthogonal:10,central,radius=0.05", "jacobian"):
+        student.zero_grad()
+        batch, stencil, gain = batch_of(expert, spec, states, order=2)
+        loss = taylor_loss(student, batch, stencil, Weights(0.5, 0.1), gain)
+        loss.total.backward()
+        gradient = torch.cat([p.grad.flatten() for p in student.parameters()])
+        found[spec] = loss.curvature.detach(), gradient
+    (differences, fd_gradient), (exact, gradient) = found.values()
+    assert float(exact) > 0.1
+    assert float(abs(differences - exact) / exact) < 0.02
+    assert float((fd_gradient - gradient).norm() / gradient.norm()) < 0.02
+
+
+def test_a_parabola_has_its_own_second_difference(states):
+    """z'Hz of x -> |x|^2 / 2 in whitened coordinates, whatever the radius."""
+
+    class Parabola(torch.nn.Module):
+        def forward(self, x):
+            """(B, n) -> (B, 1)."""
+            return (x**2).sum(dim=1, keepdim=True) / 2
+
+    curvatures = []
+    for spec in ("orthogonal:6,central", "orthogonal:6,central,radius=2", "jacobian"):
+        batch, stencil, gain = batch_of(Parabola(), spec, states, order=2)
+        loss = taylor_loss(lambda x: 0 * x[:, :1], batch, stencil, Weights(1.0, 1.0), gain)
+        curvatures.append(float(loss.curvature.detach()))
+    # E |u'Hu|, sqrt of the mean over a frame, lies near the trace of the whitened Hessian.
+    assert curvatures == pytest.approx([float((states.std(axis=0) ** 2).sum())] * 3, rel=0.05)
 
 
 @pytest.fixture(autouse=True)

@@ -10,7 +10,7 @@ from conftest import QUICK, TOY
 
 import fdtasil
 from fdtasil import errors
-from fdtasil.demonstrations import from_npz
+from fdtasil.datasets import Dataset
 from fdtasil.errors import SettingError, StorageError
 from fdtasil.seeding import episode_seeds, generator, torch_generator
 from fdtasil.storage import verify, write_bytes, write_folder
@@ -74,7 +74,7 @@ def test_a_missing_or_changed_file_is_named(tmp_path):
 @pytest.mark.parametrize("data", [b"", b"nonsense", b"PK\x03\x04"])
 def test_other_bytes_are_no_demonstrations(data):
     with pytest.raises(StorageError, match="not demonstrations"):
-        from_npz(data)
+        Dataset.from_bytes(data)
 
 
 def test_streams_are_found_by_name():
