@@ -99,11 +99,19 @@ class Answers:
     gain: float
 
     def __add__(self, other: "Answers") -> "Answers":
+        """Join the answers of two rounds; the gain is the later one's.
+
+        A coordinate may begin to move in a later round, and a basis is longer by it then: states
+        with fewer probes have some of them twice.
+        """
+        count = max(self.numbers.shape[1], other.numbers.shape[1])
+        ours, theirs = (np.arange(count) % one.numbers.shape[1] for one in (self, other))
+        later = other.numbers[:, theirs] + len(self.displacements)
         return Answers(
             np.concatenate([self.displacements, other.displacements]),
-            np.concatenate([self.numbers, other.numbers + len(self.displacements)]),
-            np.concatenate([self.values, other.values]),
-            self.gain,
+            np.concatenate([self.numbers[:, ours], later]),
+            np.concatenate([self.values[:, ours], other.values[:, theirs]]),
+            other.gain,
         )
 
 
@@ -142,7 +150,9 @@ def statistics(observations: np.ndarray, seen: np.ndarray | None = None) -> Stat
     wide = observations.astype(np.float64)
     mean, deviation = wide.mean(axis=0), wide.std(axis=0)
     moving = deviation > _ROUNDING * np.abs(wide).max(axis=0)
-    median = float(np.median(deviation[moving])) if moving.any() else 1.0
+    if not moving.any():  # a single state tells nothing of scales: raw units
+        moving, deviation = np.ones_like(moving), np.ones_like(deviation)
+    median = float(np.median(deviation[moving]))
     live = moving & (deviation > _STILL * median)
     scale = np.where(live, np.maximum(deviation, _FLOOR * median), 1.0)
     return Statistics(mean, scale, deviation, live, np.ones_like(live) if seen is None else seen)
@@ -175,9 +185,9 @@ def ask_probes(
     live = np.flatnonzero(step_scale)
     if not len(live):
         raise SettingError(
-            "no coordinate of the observations moves",
-            "states that differ",
-            "record longer or more episodes, or pass probes=0",
+            "the student sees no coordinate that moves",
+            "at least one",
+            "check student_obs, or pass probes=0",
         )
     assert probes.radius is not None, "the preset sets the radius"
     assert probes.stencil is not None, "the order sets the stencil"

@@ -115,13 +115,8 @@ class Rounds:
 
     @property
     def scales(self) -> Statistics:
-        """Scales of all states so far; which coordinates are probed is settled in round 0.
-
-        An expert may fall in the first episode, and a few states tell little of the scales.
-        """
-        states = self.data.demonstrations
-        first = statistics(states.observations[states.round == 0])
-        return replace(statistics(states.observations, self.view.seen), live=first.live)
+        """Scales of all states so far: the first episode may be a fall of three steps."""
+        return statistics(self.data.demonstrations.observations, self.view.seen)
 
     def _collect(self, round_: int, count: int) -> None:
         """Record `count` episodes, label their states and ask the probes around them."""

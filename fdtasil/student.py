@@ -23,6 +23,9 @@ ACTIVATIONS: dict[str, Callable[[], nn.Module]] = {
 }
 
 
+_HEADER = "fdtasil"
+
+
 @dataclass(frozen=True)
 class StudentShape:
     """What a student's network looks like.
@@ -154,8 +157,9 @@ class Student(nn.Module):
     def to_bytes(self, metadata: Mapping[str, str] | None = None) -> bytes:
         """Return the student as a safetensors file; equal students give equal bytes."""
         tensors = {name: tensor.cpu().contiguous() for name, tensor in self.state_dict().items()}
-        header = {"student": json.dumps(asdict(self.shape)), **(metadata or {})}
-        return safetensors.torch.save(tensors, header)
+        about = {"student": asdict(self.shape), **(metadata or {})}
+        # One entry: safetensors writes several in an order that differs from run to run.
+        return safetensors.torch.save(tensors, {_HEADER: json.dumps(about)})
 
     @classmethod
     def from_bytes(cls, data: bytes) -> "Student":
@@ -167,8 +171,8 @@ class Student(nn.Module):
         try:
             tensors = safetensors.torch.load(data)
             size = int.from_bytes(data[:8], "little")
-            header = json.loads(data[8 : 8 + size])["__metadata__"]["student"]
-            fields = json.loads(header)
+            header = json.loads(data[8 : 8 + size])["__metadata__"][_HEADER]
+            fields = json.loads(header)["student"]
             shape = StudentShape(**{**fields, "hidden": tuple(fields["hidden"])})
             bounds = {name: tensors[name].numpy() for name in ("mean", "scale", "low", "high")}
             student = cls(shape, **bounds, random=torch.Generator())

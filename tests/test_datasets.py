@@ -1,0 +1,145 @@
+"""Stored answers train other students without a question; students may see less."""
+
+import numpy as np
+import pytest
+from conftest import GAIN, QUICK, TOY, mlp_onnx
+
+import fdtasil
+from fdtasil.datasets import Dataset, load_dataset
+from fdtasil.errors import SettingError, StorageError
+from fdtasil.views import View
+
+
+def never(observations):
+    raise AssertionError("asked")
+
+
+@pytest.fixture
+def run(quick, tmp_path):
+    return quick.save(tmp_path / "run")
+
+
+@pytest.mark.parametrize("kind", ["folder", "file", "dataset"])
+def test_another_student_without_one_question(kind, run, quick):
+    source = {"folder": run, "file": run / "demonstrations.npz", "dataset": quick.dataset}[kind]
+    result = fdtasil.distill(demonstrations=source, hidden=(4, 4), steps=30)
+    assert sum(result.queries.values()) == 0
+    assert result.evaluation is None
+    assert result.student.shape.hidden == (4, 4)
+    assert result.history[0]["derivative_error"] > 0
+    assert result.report["probes"] == quick.report["probes"]
+
+
+def test_the_same_training_as_the_run_itself(run, quick):
+    settings = {"hidden": QUICK["hidden"], "steps": QUICK["steps"]}
+    again = fdtasil.distill(demonstrations=run, **settings)
+    assert again.student.to_bytes() == quick.student.to_bytes()
+
+
+def test_only_the_evaluation_asks(run, linear):
+    result = fdtasil.distill(linear, TOY, demonstrations=run, **QUICK)
+    assert result.queries["act"] == result.queries["label"] == result.queries["probe"] == 0
+    assert result.queries["evaluate"] > 0
+    assert result.evaluation.episodes == 2
+
+
+def test_stored_probes_can_be_left_or_added(run, linear, tmp_path):
+    plain = fdtasil.distill(demonstrations=run, probes=0, hidden=(4,), steps=30)
+    assert plain.history[0]["derivative_error"] == 0
+    bare = plain.save(tmp_path / "bare")
+    with pytest.raises(SettingError, match="without an expert to ask"):
+        fdtasil.distill(demonstrations=Dataset.from_bytes(_without_answers(run)), hidden=(4,))
+    added = fdtasil.distill(
+        linear, demonstrations=Dataset.from_bytes(_without_answers(run)), hidden=(4,), steps=30
+    )
+    assert added.queries["probe"] == 10 * len(added.demonstrations)
+    assert load_dataset(bare).answers is not None  # what was asked is never thrown away
+
+
+def _without_answers(run):
+    whole = load_dataset(run)
+    bounds = whole.low, whole.high
+    return Dataset(whole.demonstrations, None, None, *bounds, whole.environment).to_bytes()
+
+
+def test_a_dataset_reads_back(quick):
+    again = Dataset.from_bytes(quick.dataset.to_bytes())
+    assert again.probes == quick.dataset.probes
+    assert again.to_bytes() == quick.dataset.to_bytes()
+
+
+def test_missing_parts_are_named(run, linear, tmp_path):
+    with pytest.raises(SettingError, match="no expert"):
+        fdtasil.distill(env=TOY)
+    with pytest.raises(SettingError, match="no env"):
+        fdtasil.distill(linear)
+    with pytest.raises(SettingError, match="sizes"):
+        fdtasil.distill(env="Pendulum-v1", demonstrations=run)
+    with pytest.raises(StorageError, match="can't be read"):
+        fdtasil.distill(demonstrations=tmp_path / "nothing")
+
+
+# --- the student sees less than the expert
+
+
+def seen(observations):
+    return observations[:, :4]
+
+
+@pytest.mark.parametrize("student_obs", [range(4), seen, (3, 1, 0, 2)])
+@pytest.mark.parametrize("trainer", ["bc", "dagger", "dart"])
+def test_the_student_sees_less(student_obs, trainer, linear):
+    quick = {**QUICK, "episodes": 3}
+    result = fdtasil.distill(linear, TOY, 3, student_obs=student_obs, trainer=trainer, **quick)
+    assert result.student.shape.observation_size == 4
+    assert result.demonstrations.observations.shape[1] == 5
+    assert result.evaluation.normalized_return > 0.5
+    assert len(result.onnx_bytes()) > 100
+
+
+def test_probes_follow_what_the_student_sees(linear):
+    blind = fdtasil.distill(linear, TOY, "basis", student_obs=[0, 2], **QUICK)
+    moved = np.flatnonzero(np.abs(blind.answers.displacements).sum(axis=0))
+    assert moved.tolist() == [0, 2]
+    assert blind.queries["probe"] == 2 * len(blind.demonstrations)
+
+
+def test_indices_and_the_same_function_give_the_same_student(linear):
+    chosen = fdtasil.distill(linear, TOY, 3, student_obs=range(4), **QUICK)
+    mapped = fdtasil.distill(linear, TOY, 3, student_obs=seen, **QUICK)
+    rows = chosen.demonstrations.observations[:, :4]
+    assert np.allclose(chosen.student.act(rows), mapped.student.act(rows), atol=1e-3)
+
+
+def test_a_curved_function_needs_the_forward_stencil(linear):
+    def curved(observations):
+        return np.concatenate([observations[:, :4], observations[:, :1] ** 2], axis=1)
+
+    result = fdtasil.distill(linear, TOY, 3, student_obs=curved, **QUICK)
+    assert result.student.shape.observation_size == 5
+    with pytest.raises(SettingError, match="curved"):
+        fdtasil.distill(linear, TOY, "sphere:3,central", student_obs=curved, **QUICK)
+
+
+@pytest.mark.parametrize(
+    "wrong", [[5], [-1], [], lambda x: x[:2], lambda x: x - x.mean(axis=0), lambda x: x[:, 0]]
+)
+def test_a_wrong_view_is_refused(wrong):
+    states = np.random.default_rng(0).standard_normal((9, 5)).astype(np.float32)
+    with pytest.raises(SettingError, match="student_obs"):
+        View.of(wrong, states)
+
+
+def test_a_chosen_view_survives_saving(linear, tmp_path):
+    result = fdtasil.distill(linear, TOY, 3, student_obs=[3, 0], **QUICK)
+    again = fdtasil.Distilled.load(result.save(tmp_path))
+    assert again.view.columns == (3, 0)
+    rows = result.demonstrations.observations
+    assert np.array_equal(again.student.act(again.view.look(rows)), result.student.act(rows[:, [3, 0]]))  # fmt: skip  # noqa: E501
+
+
+def test_a_twin_is_probed_too(tmp_path):
+    expert = mlp_onnx(tmp_path / "e.onnx")
+    result = fdtasil.distill(expert, TOY, "jacobian", student_obs=[0, 1], **QUICK)
+    assert result.answers.values.shape[1] == 2
+    assert GAIN.shape == (2, 5)

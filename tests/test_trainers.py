@@ -1,0 +1,128 @@
+"""Who acts in round i."""
+
+import numpy as np
+import pytest
+from conftest import GAIN, QUICK, TOY
+
+import fdtasil
+from fdtasil.environments import EnvironmentPool
+from fdtasil.errors import SettingError
+from fdtasil.experts import load_expert
+from fdtasil.rollouts import rollout
+from fdtasil.trainers import TRAINERS, DAgger, Dart, Situation, trainer_of
+
+ROWS = np.random.default_rng(0).uniform(-0.5, 0.5, (400, 5)).astype(np.float32)
+
+
+def linear(rows):
+    return rows @ GAIN.T
+
+
+def off_by(error):
+    return lambda rows: (rows @ GAIN.T + error).astype(np.float32)
+
+
+def decide(trainer, round_, student, rows=ROWS):
+    with EnvironmentPool(TOY) as pool:
+        expert = load_expert(linear, 5, 2)
+
+        def record(behaviour, count):
+            noise = [np.random.default_rng(e) for e in range(count)]
+            return rollout(behaviour, pool, range(count), 20, noise)
+
+        behaviour = trainer.behaviour(Situation(round_, expert, student, record))
+        asked = dict(expert.queries)
+        decision = behaviour(rows, [np.random.default_rng(e) for e in range(len(rows))])
+    return decision, asked
+
+
+@pytest.mark.parametrize("name", TRAINERS)
+@pytest.mark.parametrize("episodes", [1, 2, 5, 7, 31, 100])
+def test_rounds_add_up_to_the_budget(name, episodes):
+    trainer = trainer_of(name)
+    rounds = trainer.rounds(episodes)
+    assert sum(rounds) == episodes
+    assert min(rounds) > 0
+    assert sum(trainer.queries(episodes, 10).values()) >= 10 * episodes
+
+
+def test_the_papers_rounds():
+    assert DAgger().rounds(50) == [1, 4, 15, 10, 20]
+    assert DAgger().rounds(10) == [1, 4, 5]
+    assert Dart().rounds(1) == [1]
+    assert DAgger(updates=(3, 4)).rounds(2) == [2]
+    assert DAgger(updates=()).rounds(6) == [6]
+
+
+@pytest.mark.parametrize("name", TRAINERS)
+def test_the_expert_acts_in_round_0(name):
+    decision, _ = decide(trainer_of(name), 0, None)
+    assert np.array_equal(decision.action, linear(ROWS))
+    assert np.array_equal(decision.expert_action, decision.action)
+
+
+def test_dagger_blends():
+    student = off_by(1)
+    for trainer, round_, share in [
+        (DAgger(), 1, 0.5),
+        (DAgger(), 3, 0.125),
+        (DAgger(beta=0.8), 2, 0.64),
+        (DAgger(beta=lambda i: 1 / (i + 1)), 3, 0.25),
+    ]:
+        decision, _ = decide(trainer, round_, student)
+        assert np.allclose(decision.action, linear(ROWS) + (1 - share), atol=1e-6)
+        assert np.array_equal(decision.expert_action, linear(ROWS))
+
+
+def test_dagger_switches():
+    decision, _ = decide(DAgger(beta=0.3, mix="switch"), 1, off_by(1))
+    own = np.isclose(decision.action, linear(ROWS) + 1, atol=1e-6).all(axis=1)
+    theirs = np.isclose(decision.action, linear(ROWS), atol=1e-6).all(axis=1)
+    assert (own | theirs).all()
+    assert theirs.mean() == pytest.approx(0.3, abs=0.07)
+
+
+def test_a_student_alone_is_labelled_afterwards():
+    decision, _ = decide(DAgger(beta=0.0), 1, off_by(1))
+    assert decision.expert_action is None
+    result = fdtasil.distill(linear, TOY, 0, trainer=DAgger(beta=0.0), **{**QUICK, "episodes": 3})
+    assert result.queries["act"] == 20
+    assert result.queries["label"] == 40
+    assert np.allclose(result.demonstrations.actions, linear(result.demonstrations.observations))
+
+
+def test_darts_noise_has_the_covariance_of_the_students_error():
+    error = np.array([0.3, -0.1])
+    decision, asked = decide(Dart(), 1, off_by(error))
+    noise = decision.action - linear(ROWS)
+    assert np.allclose(np.cov(noise.T), np.outer(error, error), atol=0.02)
+    assert np.array_equal(decision.expert_action, linear(ROWS))
+    assert asked == {"act": 5 * 20}
+
+
+def test_darts_alpha_is_the_noise_of_an_episode():
+    decision, _ = decide(Dart(alpha=4.0), 1, off_by(np.array([0.3, -0.1])))
+    noise = decision.action - linear(ROWS)
+    assert 20 * np.trace(noise.T @ noise / len(noise)) == pytest.approx(4.0, rel=0.15)
+
+
+def test_a_perfect_student_makes_no_noise():
+    decision, _ = decide(Dart(alpha=1.0), 1, linear)
+    assert np.allclose(decision.action, linear(ROWS), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        lambda: DAgger(beta=1.5),
+        lambda: DAgger(mix="stir"),
+        lambda: DAgger(updates=(5, 1)),
+        lambda: DAgger(updates=(0, 1)),
+        lambda: Dart(alpha=-1),
+        lambda: Dart(extra=0),
+        lambda: decide(DAgger(beta=lambda i: 2.0), 1, linear),
+    ],
+)
+def test_wrong_settings_are_refused(wrong):
+    with pytest.raises(SettingError):
+        wrong()
