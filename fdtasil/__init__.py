@@ -7,19 +7,27 @@ print(result.evaluation)
 result.to_onnx("student.onnx")
 """
 
+from fdtasil.datasets import Dataset
 from fdtasil.distilled import Distilled
 from fdtasil.errors import FdtasilError, FdtasilWarning
 from fdtasil.evaluation import Evaluation
+from fdtasil.events import Event
 from fdtasil.experts import Expert, load_expert
+from fdtasil.minari_data import from_minari, to_minari
 from fdtasil.pipeline import distill, evaluate
 from fdtasil.probes import Probes
 from fdtasil.student import Student
+from fdtasil.trainers import DAgger, Dart
 
 __version__ = "0.1.0"
 
 __all__ = [
+    "DAgger",
+    "Dart",
+    "Dataset",
     "Distilled",
     "Evaluation",
+    "Event",
     "Expert",
     "FdtasilError",
     "FdtasilWarning",
@@ -28,5 +36,7 @@ __all__ = [
     "__version__",
     "distill",
     "evaluate",
+    "from_minari",
     "load_expert",
+    "to_minari",
 ]

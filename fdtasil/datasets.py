@@ -3,7 +3,7 @@
 import io
 import json
 import zipfile
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
@@ -48,8 +48,9 @@ class Dataset:
         """Return the dataset as an npz file.
 
         Schema, version 1, all little-endian and without pickles: `observations` (N, n) float32,
-        `actions` (N, m) float32 (the expert's), `episode` (N,) and `round` (N,) int32, `low` and
-        `high` (m,) float32; with probes also `displacements` (P, n) float32, `numbers` (N, k)
+        `actions` (N, m) float32 (the expert's), `episode` (N,) and `round` (N,) int32, `taken`
+        (N, m) float32 and `rewards` (N,) float64 as in `Demonstrations`, `low` and `high` (m,)
+        float32; with probes also `displacements` (P, n) float32, `numbers` (N, k)
         int32, `values` (N, k, p, m) float32 and `gain` () float64 as in `Answers`; and `about`,
         JSON text as bytes: version, environment, probes.
         """
@@ -114,9 +115,8 @@ def _read(arrays: dict[str, np.ndarray]) -> Dataset:
     about = json.loads(arrays["about"].tobytes())
     if about["version"] > _VERSION:
         raise ValueError(f"version {about['version']} is newer than this fdtasil")
-    demonstrations = Demonstrations(
-        *(arrays[name] for name in ("observations", "actions", "episode", "round"))
-    )
+    names = [field.name for field in fields(Demonstrations)]
+    demonstrations = Demonstrations(*(arrays[name] for name in names))
     answers = None
     if "values" in arrays:
         bank, numbers, values = (arrays[name] for name in ("displacements", "numbers", "values"))

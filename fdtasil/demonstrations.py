@@ -37,23 +37,23 @@ class Demonstrations:
         actions: (N, m) float32, always the expert's answer, never clipped.
         episode: (N,) int32, the episode that the state was visited in.
         round: (N,) int32, the round that the state was collected in.
+        taken: (N, m) float32, the action of whoever acted, before clipping to the bounds.
+        rewards: (N,) float64, what the environment gave for it.
     """
 
     observations: np.ndarray
     actions: np.ndarray
     episode: np.ndarray
     round: np.ndarray
+    taken: np.ndarray
+    rewards: np.ndarray
 
     def __len__(self) -> int:
         return len(self.observations)
 
     def __add__(self, other: "Demonstrations") -> "Demonstrations":
-        return Demonstrations(
-            np.concatenate([self.observations, other.observations]),
-            np.concatenate([self.actions, other.actions]),
-            np.concatenate([self.episode, other.episode]),
-            np.concatenate([self.round, other.round]),
-        )
+        pairs = zip(vars(self).values(), vars(other).values(), strict=True)
+        return Demonstrations(*(np.concatenate(pair) for pair in pairs))
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,9 @@ def label(episodes: Episodes, expert: Expert, first_episode: int, round_: int) -
     actions = known[valid] if known is not None else expert.ask(observations, "label")
     numbers = np.arange(first_episode, first_episode + len(valid), dtype=np.int32)
     episode = np.broadcast_to(numbers[:, None], valid.shape)[valid]
-    return Demonstrations(observations, actions, episode, np.full(len(episode), round_, np.int32))
+    rounds = np.full(len(episode), round_, np.int32)
+    taken, rewards = episodes.actions[valid], episodes.rewards[valid]
+    return Demonstrations(observations, actions, episode, rounds, taken, rewards)
 
 
 def statistics(observations: np.ndarray, seen: np.ndarray | None = None) -> Statistics:

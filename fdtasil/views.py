@@ -1,7 +1,7 @@
 """What the student sees of what the expert sees."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -67,7 +67,7 @@ class View:
     def demonstrations(self, whole: Demonstrations) -> Demonstrations:
         """Return the demonstrations as the student sees them."""
         seen = np.ascontiguousarray(self.look(whole.observations), np.float32)
-        return Demonstrations(seen, whole.actions, whole.episode, whole.round)
+        return replace(whole, observations=seen)
 
     def answers(self, whole: Answers, states: np.ndarray, offsets: Sequence[float]) -> Answers:
         """Return the probes as the student sees them.

@@ -26,9 +26,9 @@ def linear_task(states=200, n=6, m=2, spec=None):
     gain = random.standard_normal((m, n)).astype(np.float32) / 4
     observations = random.standard_normal((states, n)).astype(np.float32)
     expert = load_expert(lambda rows: rows @ gain.T)
-    number = np.zeros(states, np.int32)
+    number, actions = np.zeros(states, np.int32), expert.ask(observations, "label")
     demonstrations = Demonstrations(
-        observations, expert.ask(observations, "label"), number, number
+        observations, actions, number, number, actions, np.zeros(states)
     )
     if spec is None:
         return demonstrations, None, None

@@ -27,6 +27,7 @@ ORDER = [
     "batches",
     "loss",
     "views",
+    "minari_data",
     "datasets",
     "demonstrations",
     "student",

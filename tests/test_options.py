@@ -1,0 +1,136 @@
+"""Options of training that users expect: validation, clipping, callbacks, logs, Minari."""
+
+import csv
+import json
+
+import numpy as np
+import pytest
+from conftest import QUICK, TOY
+
+import fdtasil
+from fdtasil.errors import SettingError, StorageError
+
+
+def test_validation_keeps_the_best_weights(linear):
+    held = {**QUICK, "episodes": 5, "steps": 1000, "validation": 0.4}
+    result = fdtasil.distill(linear, TOY, 3, **held)
+    losses = [entry["validation_loss"] for entry in result.history]
+    training = [entry["loss"] for entry in result.history]
+    assert losses != training
+    assert min(losses) < losses[0]
+
+
+def test_the_best_weights_are_those_of_the_best_validation(linear):
+    """A rate that makes the end worse than the middle; the student kept is the middle's."""
+    common = {**QUICK, "episodes": 5, "validation": 0.4, "learning_rate": 0.3, "steps": 400}
+    best = fdtasil.distill(linear, TOY, 0, **common)
+    step = min(best.history, key=lambda entry: entry["validation_loss"])["step"]
+    kept = []
+
+    def keep(event):
+        if event.kind == "round":
+            kept.append(event.student.to_bytes())
+
+    fdtasil.distill(linear, TOY, 0, **common, callback=keep)
+    assert kept == [best.student.to_bytes()]
+    assert step in (100, 200, 300, 400)
+
+
+def test_patience_stops_early(linear):
+    held = {**QUICK, "episodes": 4, "validation": 0.5, "patience": 2, "learning_rate": 0.0}
+    result = fdtasil.distill(linear, TOY, 0, **{**held, "steps": 5000})
+    assert [entry["step"] for entry in result.history] == [100, 200, 300]
+    assert result.report["steps"] == 300
+    with pytest.raises(SettingError, match="patience=2 without validation"):
+        fdtasil.distill(linear, TOY, 0, **QUICK, patience=2)
+
+
+def test_a_single_episode_holds_none_out(linear):
+    result = fdtasil.distill(linear, TOY, 2, **{**QUICK, "episodes": 1}, validation=0.3)
+    entry = result.history[-1]
+    assert entry["validation_loss"] == entry["loss"]
+
+
+def test_gradient_clipping_bounds_the_step(linear):
+    free = fdtasil.distill(linear, TOY, 2, **QUICK)
+    clipped = fdtasil.distill(linear, TOY, 2, **QUICK, max_gradient_norm=1e-9)
+    start = fdtasil.distill(linear, TOY, 2, **QUICK, learning_rate=0.0)
+    assert free.student.to_bytes() != clipped.student.to_bytes()
+    assert start.history[-1]["loss"] > free.history[-1]["loss"]
+
+
+def test_callbacks_hear_of_everything(linear):
+    heard = []
+    quick = {**QUICK, "episodes": 6, "steps": 200}
+    result = fdtasil.distill(linear, TOY, 2, trainer="dagger", callback=heard.append, **quick)
+    kinds = [event.kind for event in heard]
+    assert kinds == ["entry", "entry", "round"] * 3 + ["evaluation"]
+    assert [event.round for event in heard if event.kind == "round"] == [0, 1, 2]
+    assert heard[-1].evaluation == result.evaluation
+    assert [event.entry for event in heard if event.kind == "entry"] == result.history
+
+
+def test_logs_through_stable_baselines3(linear, tmp_path):
+    formats = ("csv", "json", "log", "tensorboard")
+    fdtasil.distill(linear, TOY, 2, **QUICK, out=tmp_path, log_formats=formats)
+    rows = list(csv.DictReader((tmp_path / "log/progress.csv").open()))
+    assert float(rows[0]["train/loss"]) > 0
+    lines = [json.loads(line) for line in (tmp_path / "log/progress.json").open()]
+    assert "eval/normalized_return" in lines[-1]
+    assert list((tmp_path / "log").glob("events.out.tfevents*"))
+
+
+@pytest.mark.parametrize(
+    ("wrong", "found"),
+    [
+        ({"log_formats": ("csv",)}, "without a folder"),
+        ({"log_formats": ("excel",), "out": "runs/x"}, "excel"),
+        ({"validation": 1.0}, "validation=1.0"),
+        ({"max_gradient_norm": 0.0}, "max_gradient_norm=0.0"),
+        ({"order": 3}, "order=3"),
+        ({"order": 2, "probes": "sphere:3,forward"}, "forward stencil"),
+        ({"resume": "nowhere"}, "no run to resume"),
+    ],
+)
+def test_wrong_options_are_named(wrong, found, linear, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SettingError, match=found):
+        fdtasil.distill(linear, TOY, **{"probes": 2, **QUICK, **wrong})
+
+
+@pytest.fixture
+def minari_folder(tmp_path, monkeypatch):
+    pytest.importorskip("minari")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+
+
+def test_minari_there_and_back(quick, minari_folder):
+    written = fdtasil.to_minari(quick.dataset, "toy/linear-v0", algorithm_name="linear")
+    episode = next(written.iterate_episodes())
+    assert episode.infos["probe_values"].shape == (21, 3, 1, 2)
+    assert episode.rewards.sum() > 0
+    again = fdtasil.from_minari("toy/linear-v0")
+    for name in ("observations", "actions", "episode", "taken", "rewards"):
+        found, expected = (getattr(d.demonstrations, name) for d in (again, quick.dataset))
+        assert np.array_equal(found, expected), name
+    assert np.array_equal(again.low, quick.dataset.low)
+    with pytest.raises(StorageError, match="toy/linear-v0"):
+        fdtasil.to_minari(quick.dataset, "toy/linear-v0")
+
+
+def test_cloning_from_a_dataset_alone(quick, minari_folder):
+    """No expert and no environment: the same student as plain cloning in the run itself."""
+    fdtasil.to_minari(quick.dataset, "toy/alone-v0")
+    settings = {"hidden": QUICK["hidden"], "steps": QUICK["steps"]}
+    cloned = fdtasil.distill(
+        demonstrations=fdtasil.from_minari("toy/alone-v0"), probes=0, **settings
+    )
+    again = fdtasil.distill(demonstrations=quick.dataset, probes=0, **settings)
+    rows = quick.demonstrations.observations
+    assert np.array_equal(cloned.student.act(rows), again.student.act(rows))
+    assert np.abs(cloned.student.act(rows)).max() <= 1
+
+
+def test_a_missing_dataset_is_named(minari_folder):
+    with pytest.raises(StorageError, match="no Minari dataset 'toy/none-v0'"):
+        fdtasil.from_minari("toy/none-v0")
