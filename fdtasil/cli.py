@@ -11,15 +11,19 @@ from typing import Annotated, Any, Union, get_args, get_origin
 import numpy as np
 import tyro
 
+from fdtasil.calibration import calibrate
+from fdtasil.configuration import check_count
+from fdtasil.demonstrations import statistics
 from fdtasil.distilled import Distilled
 from fdtasil.environments import EnvironmentPool, resolve_horizon
 from fdtasil.errors import FdtasilError, SettingError
+from fdtasil.evaluation import interval_text, score_text
 from fdtasil.experts import load_expert
 from fdtasil.experts.gate import examine_expert
 from fdtasil.pipeline import distill, evaluate
 from fdtasil.rollouts import follow, rollout
 from fdtasil.sb3 import export_sb3
-from fdtasil.seeding import episode_seeds
+from fdtasil.seeding import episode_seeds, generator
 from fdtasil.storage import to_json, write_bytes
 
 __all__ = ["COMMANDS", "main"]
@@ -55,6 +59,7 @@ def inspect_expert(
         horizon: Steps after which an episode is cut; default: the environment's time limit.
         seed: Of the episodes.
     """
+    check_count("episodes", episodes)
     with EnvironmentPool(env) as pool:
         boxes, length = pool.boxes, resolve_horizon(horizon, pool)
         opened = load_expert(expert, boxes.observation_size, boxes.action_size, output=output)
@@ -63,6 +68,7 @@ def inspect_expert(
         visited = recorded.observations[recorded.valid]
         spread = np.linspace(0, len(visited) - 1, 32).astype(int)
         findings = examine_expert(opened, visited[spread], boxes)
+        found = calibrate(opened, visited, statistics(visited), generator(seed, "calibration"))
     returns, falls = recorded.returns, int(recorded.terminated.sum())
     rows = [
         ("expert", expert),
@@ -72,6 +78,9 @@ def inspect_expert(
         ("actions", f"{boxes.action_size}, from {boxes.low.min():g} to {boxes.high.max():g}"),
         ("analytic", "a torch twin agrees with it" if opened.module else "not available"),
         *((f.name, f"{'FAILED: ' if f.problem else ''}{f.measured}") for f in findings),
+        ("regime", found.regime),
+        ("noise floor", f"{found.noise_floor:.1e} of the action, root mean square"),
+        ("suggested radius", f"{found.radius:.2g} standard deviations, {found.stencil} stencil"),
         ("return", f"{returns.mean():.1f} +- {returns.std():.1f} over {episodes} episodes"),
         ("ended early", f"{falls} of {episodes}, of at most {length} steps"),
     ]
@@ -85,7 +94,7 @@ def _distill(compare: bool, **arguments: Any) -> None:
     resume = arguments["resume"]
     if resume is not None and arguments["expert"] is None and arguments["env"] is None:
         arguments = {**_remembered(resume), "resume": resume}
-    elif not (arguments["out"] / "checkpoints").exists():
+    elif resume is None and not (arguments["out"] / "checkpoints").exists():
         plain = {k: str(v) if isinstance(v, Path) else v for k, v in arguments.items()}
         write_bytes(arguments["out"] / COMMAND, to_json(plain))
     result, out = distill(**arguments), resume or arguments["out"]
@@ -117,6 +126,12 @@ def _remembered(folder: Path) -> dict[str, Any]:
             "an id without a module: importing one runs code, and a file may not ask for that",
             f"repeat the arguments: fdtasil distill EXPERT ENV ... --resume {folder}",
         )
+    if arguments["trust"] is not None:
+        raise SettingError(
+            f"{folder / COMMAND} says trust={arguments['trust']!r}",
+            "trust from the caller, never from a file",
+            f"repeat the arguments: fdtasil distill EXPERT ENV ... --resume {folder}",
+        )
     tuples = {name: tuple(v) for name, v in arguments.items() if isinstance(v, list)}
     return {**arguments, **tuples}
 
@@ -143,10 +158,9 @@ def _side_by_side(result: Distilled, cloning: Distilled | None) -> str:
     for name, one in students.items():
         if one is not None and one.evaluation is not None:
             e = one.evaluation
-            interval = f"[{e.ci95[0]:.3f}, {e.ci95[1]:.3f}]"
             lines.append(
-                f"{name:15}{e.student_return:10.1f}{e.normalized_return:12.3f}"
-                f"{interval:>18}{e.survival:10.2f}"
+                f"{name:15}{e.student_return:10.1f}{score_text(e.normalized_return):>12}"
+                f"{interval_text(e.ci95):>18}{e.survival:10.2f}"
             )
     return "\n".join(lines)
 

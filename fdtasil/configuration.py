@@ -1,6 +1,7 @@
 """A run's resolved configuration: every choice made, in one frozen place."""
 
 from dataclasses import asdict, dataclass
+from numbers import Integral
 from typing import Any
 
 from fdtasil.errors import SettingError
@@ -114,12 +115,13 @@ class Configuration:
         every pool but the first of every round.
         """
         counts = self.trainer.rounds(self.episodes) if self.trainer else [0]
-        collected, total = 0, 0
+        collected, episodes, total = 0, 0, 0
         for count in counts:
             new = count * self.horizon if self.states is None else self.states
-            collected += new
+            collected, episodes = collected + new, episodes + count
+            held = self.fit.held_out(episodes) * self.horizon
             once = probes.queries(1, self.observation_size, visits=1)
-            pools = probes.pools(self.observation_size, self.fit.visits(collected))
+            pools = probes.pools(self.observation_size, self.fit.visits(collected - held))
             total += once * new + once * collected * (pools - 1)
         return total
 
@@ -130,6 +132,6 @@ def check_count(name: str, value: int) -> int:
     Raises:
         SettingError: If it is not a positive integer.
     """
-    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+    if isinstance(value, bool) or not isinstance(value, Integral) or value < 1:
         raise SettingError(f"{name}={value!r}", "a positive integer", f"write {name}=5")
-    return value
+    return int(value)

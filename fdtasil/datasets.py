@@ -49,10 +49,10 @@ class Dataset:
 
         Schema, version 1, all little-endian and without pickles: `observations` (N, n) float32,
         `actions` (N, m) float32 (the expert's), `episode` (N,) and `round` (N,) int32, `taken`
-        (N, m) float32 and `rewards` (N,) float64 as in `Demonstrations`, `low` and `high` (m,)
-        float32; with probes also `displacements` (P, n) float32, `numbers` (N, k)
-        int32, `values` (N, k, p, m) float32 and `gain` () float64 as in `Answers`; and `about`,
-        JSON text as bytes: version, environment, probes.
+        (N, m) float32, `rewards` (N,) float64 and `terminated` (N,) bool as in `Demonstrations`,
+        `low` and `high` (m,) float32; with probes also `displacements` (P, n) float32, `numbers`
+        (N, k) int32, `values` (N, k, p, m) float32 and `gain` () float64 as in `Answers`; and
+        `about`, JSON text as bytes: version, environment, probes.
         """
         arrays: dict[str, Any] = dict(vars(self.demonstrations))
         arrays |= {"low": self.low, "high": self.high}

@@ -39,6 +39,7 @@ class Demonstrations:
         round: (N,) int32, the round that the state was collected in.
         taken: (N, m) float32, the action of whoever acted, before clipping to the bounds.
         rewards: (N,) float64, what the environment gave for it.
+        terminated: (N,) bool, whether the environment ended the episode there.
     """
 
     observations: np.ndarray
@@ -47,6 +48,7 @@ class Demonstrations:
     round: np.ndarray
     taken: np.ndarray
     rewards: np.ndarray
+    terminated: np.ndarray
 
     def __len__(self) -> int:
         return len(self.observations)
@@ -58,7 +60,7 @@ class Demonstrations:
 
 @dataclass(frozen=True)
 class Statistics:
-    """Scales of the observations, taken once and frozen.
+    """Scales of the observations.
 
     Attributes:
         mean: (n,) of the states.
@@ -133,13 +135,16 @@ def label(episodes: Episodes, expert: Expert, first_episode: int, round_: int) -
     observations = episodes.observations[valid]
     if not len(observations):
         raise SettingError("no state was recorded", "at least one episode", "raise episodes=")
-    known = episodes.expert_actions
-    actions = known[valid] if known is not None else expert.ask(observations, "label")
+    actions, unknown = episodes.expert_actions[valid], ~episodes.answered[valid]
+    if unknown.any():
+        actions[unknown] = expert.ask(observations[unknown], "label")
     numbers = np.arange(first_episode, first_episode + len(valid), dtype=np.int32)
     episode = np.broadcast_to(numbers[:, None], valid.shape)[valid]
     rounds = np.full(len(episode), round_, np.int32)
     taken, rewards = episodes.actions[valid], episodes.rewards[valid]
-    return Demonstrations(observations, actions, episode, rounds, taken, rewards)
+    last = np.arange(valid.shape[1]) == episodes.lengths[:, None] - 1
+    terminated = (last & episodes.terminated[:, None])[valid]
+    return Demonstrations(observations, actions, episode, rounds, taken, rewards, terminated)
 
 
 def statistics(observations: np.ndarray, seen: np.ndarray | None = None) -> Statistics:

@@ -12,13 +12,13 @@ import numpy as np
 
 from fdtasil.datasets import Dataset
 from fdtasil.demonstrations import Answers, Demonstrations
-from fdtasil.errors import StorageError
+from fdtasil.errors import SettingError, StorageError
 from fdtasil.evaluation import Evaluation
 from fdtasil.figures import draw_returns, draw_training
 from fdtasil.onnx_files import export_module
 from fdtasil.storage import to_json, verify, write_bytes, write_folder
 from fdtasil.student import Student
-from fdtasil.views import View
+from fdtasil.views import COLUMNS, StudentObservation, View
 
 __all__ = ["Distilled"]
 
@@ -45,8 +45,9 @@ class Distilled:
     Example:
         >>> import fdtasil, numpy as np
         >>> result = fdtasil.distill(
-        ...     lambda x: 1.5 * np.tanh(-x[:, 2:3]), "Pendulum-v1", probes=2,
-        ...     episodes=1, horizon=20, steps=20, hidden=(8,), evaluation_episodes=2,
+        ...     lambda x: np.clip(-8 * np.arctan2(x[:, 1:2], x[:, :1]) - 2 * x[:, 2:], -2, 2),
+        ...     "Pendulum-v1", probes=2, episodes=1, horizon=20, steps=20, hidden=(8,),
+        ...     evaluation_episodes=2,
         ... )
         >>> result.queries["probe"]
         40
@@ -118,8 +119,15 @@ class Distilled:
         return Path(folder)
 
     @classmethod
-    def load(cls, folder: str | Path) -> "Distilled":
+    def load(
+        cls, folder: str | Path, student_obs: StudentObservation | None = None
+    ) -> "Distilled":
         """Read a run folder; nothing in it is run or unpickled.
+
+        Args:
+            folder: Where `save` wrote it.
+            student_obs: The function that the student sees through, which no file can hold;
+                without it a student of one can be asked, but not exported.
 
         Raises:
             StorageError: If a file is missing, changed since, or not one of ours.
@@ -138,7 +146,7 @@ class Distilled:
                 settings=settings,
                 report=report,
                 dataset=dataset,
-                view=_stored_view(settings["student_obs"], dataset),
+                view=_stored_view(settings["student_obs"], student_obs, dataset),
             )
         except (KeyError, TypeError, ValueError) as error:
             raise StorageError(
@@ -158,17 +166,31 @@ class Distilled:
             "fdtasil.expert_sha256": self.report["expert"]["sha256"] or "",
         }
         if self.view.columns is not None:
-            metadata["fdtasil.observation_columns"] = ",".join(map(str, self.view.columns))
+            metadata[COLUMNS] = ",".join(map(str, self.view.columns))
         if self.evaluation is not None:
             for name in ("expert_return", "student_return", "normalized_return"):
-                metadata[f"fdtasil.{name}"] = f"{getattr(self.evaluation, name):.6g}"
+                value = getattr(self.evaluation, name)
+                metadata[f"fdtasil.{name}"] = "" if value is None else f"{value:.6g}"
         return metadata
 
 
-def _stored_view(student_obs: list[int] | str | None, dataset: Dataset) -> View:
-    if isinstance(student_obs, str):
-        raise ValueError(f"the student sees through {student_obs}, which no file can hold")
-    return View.of(student_obs, dataset.demonstrations.observations[:2])
+def _stored_view(
+    stored: list[int] | str | None, given: StudentObservation | None, dataset: Dataset
+) -> View:
+    states = dataset.demonstrations.observations[:256]
+    if not isinstance(stored, str):
+        return View.of(stored, states)
+    if given is not None:
+        return View.of(given, states)
+
+    def missing(rows: np.ndarray) -> np.ndarray:
+        raise SettingError(
+            f"the student sees through {stored}, which no file can hold",
+            "the function itself",
+            "pass it: Distilled.load(folder, student_obs=...)",
+        )
+
+    return View(missing, None, 0, np.ones(states.shape[1], bool))
 
 
 def _csv(history: list[dict[str, float]]) -> bytes:

@@ -4,6 +4,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from numbers import Integral
 from types import TracebackType
 
 import gymnasium
@@ -67,7 +68,11 @@ class EnvironmentPool:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the first copy has said it all
             while self._owned and len(self._members) < count:
-                self._members.append(self._new())
+                made = self._new()
+                if any(made is member for member in self._members):
+                    self._owned = False  # a factory that hands out one and the same
+                    break
+                self._members.append(made)
         return self._members[:count]
 
     def close(self) -> None:
@@ -115,13 +120,13 @@ def resolve_horizon(horizon: int | None, pool: EnvironmentPool) -> int:
     """
     if horizon is None:
         horizon = pool.time_limit
-    if isinstance(horizon, bool) or not isinstance(horizon, int) or horizon < 1:
+    if isinstance(horizon, bool) or not isinstance(horizon, Integral) or horizon < 1:
         raise SettingError(
             f"horizon={horizon!r} for {pool.name}",
             "a positive number of steps, or an environment with a time limit of its own",
             "write for example horizon=300",
         )
-    return horizon
+    return int(horizon)
 
 
 @contextmanager
@@ -165,7 +170,7 @@ def _factory(environment: EnvironmentLike) -> Callable[[], gymnasium.Env]:
 def _read_boxes(environment: gymnasium.Env, name: str) -> Boxes:
     observation = _flat_box(environment.observation_space, name, "observations")
     action = _flat_box(environment.action_space, name, "actions")
-    low, high = action.low.astype(np.float32), action.high.astype(np.float32)
+    low, high = (_bound(bound) for bound in (action.low, action.high))
     if not (low < high).all():
         raise EnvironmentFault(
             f"{name}: action bounds {low} to {high}",
@@ -173,6 +178,12 @@ def _read_boxes(environment: gymnasium.Env, name: str) -> Boxes:
             "drop the fixed actions with a gymnasium.ActionWrapper",
         )
     return Boxes(int(observation.shape[0]), low, high)
+
+
+def _bound(bound: np.ndarray) -> np.ndarray:
+    """Return bounds as float32; those as large as float32 itself are a way to say none."""
+    wide = bound.astype(np.float64)
+    return np.where(np.abs(wide) > 1e30, np.sign(wide) * np.inf, wide).astype(np.float32)
 
 
 def _flat_box(space: gymnasium.Space, name: str, role: str) -> gymnasium.spaces.Box:

@@ -1,5 +1,6 @@
 """Paired evaluation: student and expert from the same starts, with an interval."""
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -7,11 +8,12 @@ from typing import Any
 import numpy as np
 
 from fdtasil.environments import EnvironmentPool
+from fdtasil.errors import FdtasilWarning
 from fdtasil.experts import Expert
 from fdtasil.rollouts import Behaviour, Decision, Episodes, Policy, follow, rollout
 from fdtasil.seeding import generator
 
-__all__ = ["Evaluation", "compare", "random_behaviour"]
+__all__ = ["Evaluation", "compare", "interval_text", "random_behaviour", "score_text"]
 
 _RESAMPLES = 2000
 
@@ -25,10 +27,12 @@ class Evaluation:
         horizon: T, steps after which an episode was cut.
         expert_return: Mean undiscounted return of the expert.
         student_return: Mean undiscounted return of the student.
-        reference_return: What counts as zero: 0 where the expert's returns are positive, else
-            the mean return of uniformly random actions.
-        normalized_return: (student - reference) / (expert - reference); 1 is the expert.
-        ci95: 95 % bootstrap interval of the normalised return, over paired episodes.
+        reference_return: What counts as zero: 0 where the expert's median return is positive,
+            else the mean return of uniformly random actions.
+        normalized_return: (student - reference) / (expert - reference); 1 is the expert. None
+            where the expert is no better than the reference, and the share means nothing.
+        ci95: 95 % bootstrap interval of the normalised return, over paired episodes; None with it,
+            or for a single pair.
         survival: Share of the student's episodes that the environment did not end.
         expert_survival: The same for the expert.
         action_error: Mean Euclidean distance of the student's action to the expert's, on the
@@ -45,8 +49,8 @@ class Evaluation:
     expert_return: float
     student_return: float
     reference_return: float
-    normalized_return: float
-    ci95: tuple[float, float]
+    normalized_return: float | None
+    ci95: tuple[float, float] | None
     survival: float
     expert_survival: float
     action_error: float
@@ -68,10 +72,9 @@ class Evaluation:
         return cls(**{**fields, **lists})
 
     def __str__(self) -> str:
-        low, high = self.ci95
         expert = f"{self.expert_return:10.1f}   survival {self.expert_survival:.2f}"
         student = f"{self.student_return:10.1f}   survival {self.survival:.2f}"
-        share = f"{self.normalized_return:10.3f}   95 % [{low:.3f}, {high:.3f}]"
+        share = f"{score_text(self.normalized_return):>10}   95 % {interval_text(self.ci95)}"
         return (
             f"{self.episodes} paired episodes of {self.horizon} steps\n"
             f"  expert            {expert}\n"
@@ -105,6 +108,15 @@ def compare(
     student_episodes = rollout(follow(student), pool, seeds, horizon, on_step=on_step)
     reference = _reference_return(expert_episodes, pool, seeds, horizon, seed)
     ours, theirs = student_episodes.returns, expert_episodes.returns
+    meaningful = float(theirs.mean()) > reference
+    if not meaningful:
+        warnings.warn(
+            f"the expert's return {theirs.mean():.4g} is not above {reference:.4g}, that of "
+            "random actions: no normalised return; check that expert and environment belong "
+            "together",
+            FdtasilWarning,
+            stacklevel=2,
+        )
     visited = student_episodes.observations[student_episodes.valid]
     own = student_episodes.actions[student_episodes.valid]
     distance = np.linalg.norm(own - expert.ask(visited, "evaluate"), axis=1)
@@ -114,8 +126,8 @@ def compare(
         expert_return=float(theirs.mean()),
         student_return=float(ours.mean()),
         reference_return=reference,
-        normalized_return=float((ours.mean() - reference) / (theirs.mean() - reference)),
-        ci95=_interval(ours - reference, theirs - reference, seed),
+        normalized_return=_share(ours - reference, theirs - reference) if meaningful else None,
+        ci95=_interval(ours - reference, theirs - reference, seed) if meaningful else None,
         survival=float(1 - student_episodes.terminated.mean()),
         expert_survival=float(1 - expert_episodes.terminated.mean()),
         action_error=float(distance.mean()),
@@ -143,20 +155,36 @@ def random_behaviour(pool: EnvironmentPool) -> Behaviour:
 def _reference_return(
     expert: Episodes, pool: EnvironmentPool, seeds: list[int], horizon: int, seed: int
 ) -> float:
-    if (expert.returns > 0).all():
+    if np.median(expert.returns) > 0:
         return 0.0
     noise = [generator(seed, "random actions", episode) for episode in range(len(seeds))]
     return float(rollout(random_behaviour(pool), pool, seeds, horizon, noise).returns.mean())
 
 
-def _interval(ours: np.ndarray, theirs: np.ndarray, seed: int) -> tuple[float, float]:
+def score_text(share: float | None) -> str:
+    """Return a normalised return for a table."""
+    return "n/a" if share is None else f"{share:.3f}"
+
+
+def interval_text(interval: tuple[float, float] | None) -> str:
+    """Return an interval for a table."""
+    return "n/a" if interval is None else f"[{interval[0]:.3f}, {interval[1]:.3f}]"
+
+
+def _share(ours: np.ndarray, theirs: np.ndarray) -> float:
+    return float(ours.mean() / theirs.mean())
+
+
+def _interval(ours: np.ndarray, theirs: np.ndarray, seed: int) -> tuple[float, float] | None:
     from scipy import stats  # loads for most of a second, and many runs end before it
 
     def ratio(a: np.ndarray, b: np.ndarray, axis: int = -1) -> np.ndarray:
         return a.mean(axis=axis) / b.mean(axis=axis)
 
-    if len(ours) < 2 or np.ptp(ours / theirs) == 0:
-        point = float(ratio(ours, theirs))
+    if len(ours) < 2:
+        return None
+    if np.array_equal(ours * theirs[0], theirs * ours[0]):  # one ratio for all: nothing to draw
+        point = _share(ours, theirs)
         return point, point
     result = stats.bootstrap(
         (ours, theirs),

@@ -21,6 +21,7 @@ class Event:
         kind: "entry" (100 training steps), "round" (a round's student is trained), or
             "evaluation".
         round: Number of the round.
+        step: Training steps so far, of all rounds.
         entry: The history's newest entry.
         student: The round's student, not to be changed; None for an entry.
         evaluation: Student against expert; of an evaluation only.
@@ -28,6 +29,7 @@ class Event:
 
     kind: Literal["entry", "round", "evaluation"]
     round: int
+    step: int
     entry: dict[str, float]
     student: Student | None = None
     evaluation: Evaluation | None = None
@@ -46,7 +48,11 @@ def tell_all(callback: Callback | None, formats: Sequence[str], folder: Path | N
         raise SettingError(
             f"log_formats={tuple(formats)!r} without a folder", "out=", 'write out="runs/mine"'
         )
-    log = open_log(folder / "log", formats) if formats and folder is not None else None
+    log = None
+    if formats and folder is not None:
+        # A resumed run logs into a folder of its own: the logger begins its files anew.
+        earlier = len(list(folder.glob("log*")))
+        log = open_log(folder / (f"log-{earlier + 1}" if earlier else "log"), formats)
 
     def tell(event: Event) -> None:
         if log is not None:
@@ -55,7 +61,7 @@ def tell_all(callback: Callback | None, formats: Sequence[str], folder: Path | N
                 numbers = event.evaluation.to_json().items()
                 values |= {f"eval/{k}": v for k, v in numbers if isinstance(v, float)}
             if event.kind != "round":
-                log(int(event.entry["step"]), values)
+                log(event.step, values)
         if callback is not None:
             callback(event)
 

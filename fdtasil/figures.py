@@ -4,7 +4,7 @@ import io
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
-from fdtasil.evaluation import Evaluation
+from fdtasil.evaluation import Evaluation, interval_text, score_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -49,9 +49,9 @@ def draw_returns(evaluation: Evaluation) -> bytes:
     student = [evaluation.student_returns[e] for e in order]
     panel.scatter(places, expert, marker="s", s=22, color=_EXPERT, label="expert", zorder=2)
     panel.scatter(places, student, marker="o", s=26, color=_STUDENT, label="student", zorder=3)
-    low, high = evaluation.ci95
     panel.set_title(
-        f"normalised return {evaluation.normalized_return:.3f}, 95 % [{low:.3f}, {high:.3f}], "
+        f"normalised return {score_text(evaluation.normalized_return)}, "
+        f"95 % {interval_text(evaluation.ci95)}, "
         f"survival {evaluation.survival:.2f}",
         fontsize=9,
     )

@@ -83,13 +83,19 @@ class Fit:
 
     def steps_an_epoch(self, states: int) -> int:
         """Return the minibatches that visit each of `states` states once."""
-        return max(1, states // self.batch_size)
+        return max(1, -(-states // self.batch_size))
 
     def total_steps(self, states: int) -> int:
         """Return the gradient steps of a training on `states` states."""
         if self.steps is not None:
             return self.steps
         return (self.epochs or 0) * self.steps_an_epoch(states)
+
+    def held_out(self, episodes: int) -> int:
+        """Return how many of `episodes` episodes are held out."""
+        if self.validation == 0 or episodes < 2:
+            return 0
+        return min(max(1, round(self.validation * episodes)), episodes - 1)
 
     def visits(self, states: int) -> int:
         """Return how often each state is visited, the last incomplete epoch counted whole."""
@@ -162,6 +168,8 @@ def fit(
     )
     weights = Weights(settings.weight, settings.curvature_weight if order == 2 else None)
     stencil = probes.stencil if probes else None
+    # Taken once, of the first pool: two validations then differ by the student alone.
+    judge = batches.visit(held_out, 0) if len(held_out) else None
     state = FitState(student, optimiser)
     if resume is not None:
         state.restore(resume)
@@ -185,7 +193,7 @@ def fit(
         optimiser.step()
         state.count(losses.detach())
         if state.step % _LOG_EVERY == 0 or state.step == steps:
-            held = _held_out_loss(loss_of, batches, held_out) if len(held_out) else None
+            held = None if judge is None else float(loss_of(judge)[0].detach())
             entry = state.log(held)
             _check_finite(entry)
             told.entry(entry)
@@ -207,19 +215,10 @@ def _split(
     """Return the rows to train on and those of held-out episodes."""
     everything = torch.arange(len(demonstrations))
     episodes = np.unique(demonstrations.episode)
-    if settings.validation == 0 or len(episodes) < 2:
-        return everything, everything[:0]
-    held = min(max(1, round(settings.validation * len(episodes))), len(episodes) - 1)
+    held = settings.held_out(len(episodes))
     chosen = episodes[torch.randperm(len(episodes), generator=random)[:held].numpy()]
     outside = torch.from_numpy(np.isin(demonstrations.episode, chosen))
     return everything[~outside], everything[outside]
-
-
-def _held_out_loss(
-    loss_of: Callable[[Minibatch], Tensor], batches: Batches, rows: Tensor
-) -> float:
-    # Always the same visit, so that two validations differ by the student alone.
-    return float(loss_of(batches.visit(rows, 0))[0].detach())
 
 
 def _cosine(peak: float, step: int, steps: int) -> float:

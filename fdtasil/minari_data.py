@@ -49,6 +49,8 @@ def from_minari(source: "str | minari.MinariDataset") -> Dataset:
             "flatten it, or choose another",
         )
     episodes = [_read(number, episode) for number, episode in enumerate(data.iterate_episodes())]
+    if not episodes:
+        raise StorageError(f"{source!r} has no episodes", "at least one", "choose another dataset")
     states = episodes[0]
     for episode in episodes[1:]:
         states = states + episode
@@ -91,8 +93,8 @@ def to_minari(dataset: Dataset, dataset_id: str, **about: str) -> "minari.Minari
                 observations=states.observations[doubled],
                 actions=states.taken[rows],
                 rewards=states.rewards[rows].tolist(),
-                terminations=[False] * steps,
-                truncations=[False] * (steps - 1) + [True],
+                terminations=states.terminated[rows].tolist(),
+                truncations=[False] * (steps - 1) + [not states.terminated[rows[-1]]],
                 infos=infos,
             )
         )
@@ -125,6 +127,7 @@ def _read(number: int, episode: Any) -> Demonstrations:
         np.zeros(steps, np.int32),
         taken,
         np.asarray(episode.rewards, np.float64),
+        np.asarray(episode.terminations, bool),
     )
 
 

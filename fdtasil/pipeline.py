@@ -8,7 +8,7 @@ import torch
 
 from fdtasil.compute import pick_device, torch_settings
 from fdtasil.configuration import GATE_STATES, Configuration, check_count
-from fdtasil.datasets import Dataset, DatasetLike, load_dataset
+from fdtasil.datasets import DatasetLike, load_dataset
 from fdtasil.distilled import Distilled
 from fdtasil.environments import EnvironmentLike, EnvironmentPool, resolve_horizon
 from fdtasil.evaluation import Evaluation, compare
@@ -25,17 +25,19 @@ from fdtasil.sb3 import Trust
 from fdtasil.seeding import check_seed, episode_seeds
 from fdtasil.storage import sha256
 from fdtasil.student import check_shape
-from fdtasil.subject import Subject, open_subject, source_of
-from fdtasil.trainers import Trainer, trainer_of
-from fdtasil.views import StudentObservation, describe_view
+from fdtasil.subject import Subject, open_subject, source_of, trainer_for
+from fdtasil.trainers import Trainer
+from fdtasil.views import StudentObservation, View, columns_of, describe_view
 
 __all__ = ["distill", "evaluate"]
+
+DEFAULT_PROBES = 10
 
 
 def distill(
     expert: ExpertLike | None = None,
     env: EnvironmentLike | None = None,
-    probes: int | str | Probes = 10,
+    probes: int | str | Probes = DEFAULT_PROBES,
     *,
     trainer: str | Trainer = "bc",
     episodes: int = 20,
@@ -48,7 +50,7 @@ def distill(
     output: str | None = None,
     trust: Trust = None,
     student_obs: StudentObservation | None = None,
-    hidden: tuple[int, ...] | None = None,
+    hidden: tuple[int, ...] | int | None = None,
     activation: str | None = None,
     steps: int | None = None,
     epochs: int | None = None,
@@ -101,7 +103,7 @@ def distill(
             code that is in it.
         student_obs: Indices of the coordinates that the student sees, or a function
             (B, n) -> (B, k); the expert sees all. Probes move only what the student sees.
-        hidden: Widths of the student's hidden layers.
+        hidden: Widths of the student's hidden layers, or that of the only one.
         activation: One of elu, gelu, relu, silu, tanh.
         steps: Gradient steps of a round; leave out where `epochs` is given.
         epochs: Visits of each state in a round; leave out where `steps` is given.
@@ -137,8 +139,9 @@ def distill(
 
     Example:
         >>> result = distill(
-        ...     lambda observations: 1.5 * np.tanh(-observations[:, 2:3]), "Pendulum-v1", probes=4,
-        ...     episodes=2, horizon=50, steps=50, hidden=(16,), evaluation_episodes=2,
+        ...     lambda x: np.clip(-8 * np.arctan2(x[:, 1:2], x[:, :1]) - 2 * x[:, 2:], -2, 2),
+        ...     "Pendulum-v1", probes=4, episodes=2, horizon=50, steps=50, hidden=16,
+        ...     evaluation_episodes=2,
         ... )
         >>> result.student.predict(result.demonstrations.observations[0])[0].shape
         (1,)
@@ -157,16 +160,20 @@ def distill(
         validation=validation,
         patience=patience,
     )
-    source = source_of(defaults.complete(Probes.parse(probes)), order, given)
+    source = source_of(probes, defaults, order, given, usual=DEFAULT_PROBES)
     place = pick_device(device)
+    widths = (hidden,) if isinstance(hidden, int) else hidden
     check_seed(seed)
-    check_shape(hidden or (), activation or defaults.activation)
-    with open_subject(expert, env, given, output=output, trust=trust) as subject:
+    check_shape(widths or (), activation or defaults.activation)
+    with (
+        noted_warnings() as notes,
+        open_subject(expert, env, given, output=output, trust=trust) as subject,
+    ):
         run = Configuration(
             expert=subject.expert_name,
             expert_sha256=subject.expert.sha256 if subject.expert else None,
             env=subject.environment,
-            trainer=None if given else trainer_of(trainer),
+            trainer=trainer_for(trainer, given),
             demonstrations=sha256(given.to_bytes()) if given else None,
             states=len(given.demonstrations) if given else None,
             probes=source,
@@ -174,7 +181,7 @@ def distill(
             order=order if source else 0,
             observation_size=subject.observation_size,
             student_obs=describe_view(student_obs),
-            hidden=defaults.hidden if hidden is None else tuple(hidden),
+            hidden=defaults.hidden if widths is None else tuple(widths),
             activation=defaults.activation if activation is None else activation,
             fit=settings,
             episodes=check_count("episodes", episodes),
@@ -192,9 +199,20 @@ def distill(
         config = {**run.to_json(), "versions": versions()}
         kept = RunFolder(folder, config, resume=resume is not None)
         if folder and kept.finished and resume is not None:
-            return Distilled.load(folder)
+            return Distilled.load(folder, student_obs)
         told = tell_all(callback, log_formats, folder)
-        result = _go(run, subject, given, kept, student_obs, place, told, progress, force=force)
+        rounds = Rounds(
+            run,
+            subject.expert,
+            subject.pool,
+            student_obs,
+            place,
+            Stages(progress),
+            kept,
+            told,
+            given,
+        )
+        result = _go(rounds, subject, notes, force=force)
     if folder:
         result.save(folder)
         kept.close()
@@ -209,6 +227,9 @@ def evaluate(
     episodes: int = 20,
     horizon: int | None = None,
     seed: int = 0,
+    output: str | None = None,
+    trust: Trust = None,
+    student_obs: StudentObservation | None = None,
     force: bool = False,
     progress: bool = True,
 ) -> Evaluation:
@@ -223,6 +244,10 @@ def evaluate(
         episodes: Number of paired episodes.
         horizon: Steps after which an episode is cut; default: the environment's time limit.
         seed: Of the starts; those of `distill` with the same seed.
+        output: Name of the expert's ONNX output with the actions, where several could be it.
+        trust: As `load_expert`, for the expert.
+        student_obs: What the policy sees, as in `distill`; an ONNX file that fdtasil exported
+            says its indices itself.
         force: Go on with a warning where the expert fails the gate but answers.
         progress: Show progress bars, where there is a terminal.
 
@@ -233,76 +258,57 @@ def evaluate(
 
     Example:
         >>> def swing(observations):
-        ...     return 1.5 * np.tanh(-observations[:, 2:3])
+        ...     cosine, sine, speed = observations.T
+        ...     return np.clip(-8 * np.arctan2(sine, cosine) - 2 * speed, -2, 2)[:, None]
         >>> evaluate(swing, swing, "Pendulum-v1", episodes=2, horizon=50).normalized_return
         1.0
     """
     check_seed(seed)
     stages = Stages(progress)
-    with EnvironmentPool(env) as pool:
+    with EnvironmentPool(env) as pool, torch_settings(torch.device("cpu")):
         n, m = pool.boxes.observation_size, pool.boxes.action_size
-        black_box = load_expert(expert, n, m)
-        student = load_expert(policy, n, m)
+        black_box = load_expert(expert, n, m, output=output, trust=trust)
         length = resolve_horizon(horizon, pool)
         starts = episode_seeds(seed, "evaluation", 0, check_count("episodes", episodes))
         theirs = _gate(black_box, pool, starts, length, stages, force=force)
-        answer = student.policy("evaluate")
+        seen = columns_of(policy) if student_obs is None else student_obs
+        view = View.of(seen, theirs.observations[theirs.valid][:256])
+        student = load_expert(policy, view.size, m)
+        answer = view.policy(student.policy("evaluate"))
         return _compare(answer, black_box, theirs, pool, length, seed, stages)
 
 
-def _go(
-    run: Configuration,
-    subject: Subject,
-    given: Dataset | None,
-    kept: RunFolder,
-    student_obs: StudentObservation | None,
-    device: torch.device,
-    told: Callback,
-    progress: bool,
-    *,
-    force: bool,
-) -> Distilled:
+def _go(rounds: Rounds, subject: Subject, notes: list[str], *, force: bool) -> Distilled:
     """Gate, rounds, comparison, report."""
-    stages, expert, pool = Stages(progress), subject.expert, subject.pool
-    with torch_settings() as precision, noted_warnings() as notes:
+    run, stages, expert, pool = rounds.run, rounds.stages, subject.expert, subject.pool
+    with torch_settings(rounds.device) as precision:
         theirs = None
         if expert is not None and pool is not None:
             starts = episode_seeds(run.seed, "evaluation", 0, run.evaluation_episodes)
             theirs = _gate(expert, pool, starts, run.horizon, stages, force=force)
         started = time.perf_counter()
-        rounds = Rounds(run, expert, pool, student_obs, device, stages, kept, told, given)
         rounds.all()
-        seconds = time.perf_counter() - started
-        student, evaluation = rounds.trained, None
+        seconds, student, evaluation = time.perf_counter() - started, rounds.trained, None
         if expert is not None and pool is not None and theirs is not None:
             policy = rounds.view.policy(student.act)
             evaluation = _compare(policy, expert, theirs, pool, run.horizon, run.seed, stages)
-            told(
-                Event(
-                    "evaluation",
-                    int(rounds.history[-1]["round"]),
-                    rounds.history[-1],
-                    student,
-                    evaluation,
-                )
+            last = rounds.history[-1]
+            event = Event(
+                "evaluation", int(last["round"]), rounds.steps, last, student, evaluation
             )
-        report = report_of(
-            run,
-            evaluation,
-            rounds,
-            train_seconds=seconds,
-            matmul_precision=precision,
-            notes=notes,
-        )
-    return Distilled(
-        student,
+            rounds.callback(event)
+    report = report_of(
+        run,
         evaluation,
-        rounds.history,
-        report["queries"],
-        {**run.to_json(), "versions": report["versions"]},
-        report,
-        rounds.data,
-        rounds.view,
+        rounds,
+        train_seconds=seconds,
+        matmul_precision=precision,
+        notes=notes,
+    )
+    settings = {**run.to_json(), "versions": report["versions"]}
+    history, queries = rounds.history, report["queries"]
+    return Distilled(
+        student, evaluation, history, queries, settings, report, rounds.data, rounds.view
     )
 
 

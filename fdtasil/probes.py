@@ -212,6 +212,19 @@ class Probes:
             raise SettingError(
                 f"radius={self.radius!r}", "a positive number", "write for example radius=0.15"
             )
+        if self.space not in (None, "whitened", "raw"):
+            raise SettingError(f"space={self.space!r}", '"whitened" or "raw"', "choose one")
+        if (
+            getattr(self.directions, "probes", 1) is not None
+            and not getattr(self.directions, "probes", 1) > 0
+        ):
+            raise SettingError(f"{self.directions}", "a positive number of probes", _EXAMPLES)
+        if (self.stencil is EXACT) and self.directions != OrthogonalFrames():
+            raise SettingError(
+                f"the exact stencil with {self.directions}",
+                "whole frames, which hold the Jacobian",
+                'write probes="jacobian"',
+            )
         if self.per_step not in (None, "all"):
             if not isinstance(self.per_step, int) or self.per_step < 1:
                 raise SettingError(
@@ -255,6 +268,8 @@ class Probes:
             and (name == "jacobian") == (self.stencil is EXACT)
         )
         count = getattr(self.directions, "probes", None)
+        if design == "orthogonal" and count is None:
+            count = "all"
         parts = [design if count is None else f"{design}:{count}"]
         parts += [self.stencil.name] if self.stencil not in (None, EXACT) else []
         parts += ["resample"] if self.resample else []
@@ -293,8 +308,8 @@ class Probes:
     def pools(self, dimension: int, visits: int) -> int:
         """Return how often the expert is asked for a new set of answers; see `queries`."""
         count = self.directions.count(dimension)
-        used = visits * self.used_per_visit(count)
-        return max(1, -(-used // count)) if self.resample else 1
+        last = (visits - 1) * self.used_per_visit(count) // count
+        return last + 1 if self.resample else 1
 
     def used_per_visit(self, count: int) -> int:
         """Return how many of a state's `count` probes one visit uses."""
@@ -307,16 +322,25 @@ _EXAMPLES = "write for example probes=10, or probes=0 for plain behaviour clonin
 
 def _parse_text(spec: str) -> Probes:
     design, *options = (part.strip() for part in spec.split(","))
-    match = re.fullmatch(r"([a-z]+)(?::(\d+))?", design)
+    match = re.fullmatch(r"([a-z]+)(?::(\d+|all))?", design)
     if not match or match[1] not in DIRECTIONS or match[2] == "0":
         raise SettingError(f"probes={spec!r}", _GRAMMAR, f"designs: {', '.join(DIRECTIONS)}")
     if match[2] and match[1] in ("basis", "jacobian"):
         raise SettingError(
             f"probes={spec!r}: {match[1]} takes no count", _GRAMMAR, f'write "{match[1]}"'
         )
-    directions = DIRECTIONS[match[1]](int(match[2]) if match[2] else None)
+    if match[2] == "all":
+        if match[1] != "orthogonal":
+            raise SettingError(f"probes={spec!r}", _GRAMMAR, 'write "basis" or "orthogonal:all"')
+        directions = OrthogonalFrames()
+    else:
+        directions = DIRECTIONS[match[1]](int(match[2]) if match[2] else None)
     probes = Probes(directions, EXACT if match[1] == "jacobian" else None)
     for option in options:
+        if match[1] == "jacobian" and option in STENCILS:
+            raise SettingError(
+                f"probes={spec!r}", "no stencil: the derivative is exact", _EXAMPLES
+            )
         probes = replace(probes, **_parse_option(option, spec))
     return probes
 

@@ -56,7 +56,8 @@ class Episodes:
     Attributes:
         observations: (E, T, n) float32, what the policy saw.
         actions: (E, T, m) float32, what it said, before clipping to the bounds.
-        expert_actions: (E, T, m) float32 where the behaviour knew the expert's answers, or None.
+        expert_actions: (E, T, m) float32, the expert's answers that the behaviour had.
+        answered: (E, T) bool, where it had one.
         rewards: (E, T) float64.
         valid: (E, T) bool, true up to and including the step that ended the episode.
         seeds: (E,) reset seeds.
@@ -68,7 +69,8 @@ class Episodes:
 
     observations: np.ndarray
     actions: np.ndarray
-    expert_actions: np.ndarray | None
+    expert_actions: np.ndarray
+    answered: np.ndarray
     rewards: np.ndarray
     valid: np.ndarray
     seeds: np.ndarray
@@ -153,7 +155,8 @@ class _Record:
         n, m = pool.boxes.observation_size, pool.boxes.action_size
         self.observations = np.zeros((episodes, horizon, n), np.float32)
         self.actions = np.zeros((episodes, horizon, m), np.float32)
-        self.expert_actions: np.ndarray | None = None
+        self.expert_actions = np.zeros((episodes, horizon, m), np.float32)
+        self.answered = np.zeros((episodes, horizon), bool)
         self.rewards = np.zeros((episodes, horizon))
         self.valid = np.zeros((episodes, horizon), bool)
         self.terminated = np.zeros(episodes, bool)
@@ -162,19 +165,26 @@ class _Record:
     def decide(
         self, alive: list[int], step: int, observations: np.ndarray, decision: Decision
     ) -> None:
+        expected = (len(alive), self.actions.shape[2])
+        if decision.action.shape != expected:
+            raise EnvironmentFault(
+                f"a policy answered with actions of shape {decision.action.shape}",
+                f"{expected}, as the environment takes",
+                "check that policy and environment belong together",
+            )
         self.observations[alive, step] = observations
         self.actions[alive, step] = decision.action
         self.valid[alive, step] = True
         if decision.expert_action is not None:
-            if self.expert_actions is None:
-                self.expert_actions = np.zeros_like(self.actions)
             self.expert_actions[alive, step] = decision.expert_action
+            self.answered[alive, step] = True
 
     def episodes(self, seeds: Sequence[int]) -> Episodes:
         return Episodes(
             self.observations,
             self.actions,
             self.expert_actions,
+            self.answered,
             self.rewards,
             self.valid,
             np.asarray(seeds, np.int64),

@@ -93,7 +93,7 @@ class Rounds:
             if not self._restore_trained(round_):
                 self._train(round_)
                 self._keep_trained(round_)
-            self.callback(Event("round", round_, self.history[-1], self.student))
+            self.callback(Event("round", round_, self.steps, self.history[-1], self.student))
 
     @property
     def data(self) -> Dataset:
@@ -144,13 +144,13 @@ class Rounds:
             self.dataset = replace(before, demonstrations=before.demonstrations + new)
             old = before.answers
         if self.run.probes is not None:
-            answers = self._ask(new.observations, round_, 0)
+            answers = self.ask(new.observations, round_, 0)
             answers = old + answers if old is not None else answers
             self.dataset = replace(self.dataset, probes=self.run.probes, answers=answers)
 
     def _probe_given(self) -> None:
         """Ask the probes around given states."""
-        answers = self._ask(self.data.demonstrations.observations, 0, 0)
+        answers = self.ask(self.data.demonstrations.observations, 0, 0)
         self.dataset = replace(self.data, probes=self.run.probes, answers=answers)
 
     def _record(
@@ -162,7 +162,8 @@ class Rounds:
         with self.stages.stage("demonstrations", count * horizon, "step") as move:
             return rollout(behaviour, pool, seeds, horizon, noise, move)
 
-    def _ask(self, observations: np.ndarray, *path: int) -> Answers:
+    def ask(self, observations: np.ndarray, *path: int) -> Answers:
+        """Ask the probes around states, along the directions of a named stream."""
         probes, expert = self.run.probes, self.expert
         assert probes is not None
         if expert is None:
@@ -219,7 +220,7 @@ class Rounds:
             nonlocal last
             move(int(entry["step"]) - last)
             last = int(entry["step"])
-            self.callback(Event("entry", round_, {"round": round_, **entry}))
+            self.callback(Event("entry", round_, self.steps + last, {"round": round_, **entry}))
 
         return tell
 
@@ -308,11 +309,10 @@ class _Pools:
         return self._view.answers(answers, observations, probes.stencil.offsets)
 
     def _ask(self, observations: np.ndarray, number: int) -> Answers:
-        answers = self._rounds._ask(observations, self._round, number)
-        expert = self._rounds.expert
-        if number == self._asked_before and expert is not None:
-            # The interrupted run has asked and counted these.
-            rows = answers.values.shape[0] * answers.values.shape[1] * answers.values.shape[2]
-            expert.queries["probe"] -= rows
-            expert.queries["again"] += rows
+        queries = self._rounds.expert.queries if self._rounds.expert else Counter[str]()
+        before = queries["probe"]
+        answers = self._rounds.ask(observations, self._round, number)
+        if number == self._asked_before:  # the interrupted run has asked and counted these
+            queries["again"] += queries["probe"] - before
+            queries["probe"] = before
         return answers

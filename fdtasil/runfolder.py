@@ -33,20 +33,18 @@ class RunFolder:
     """
 
     def __init__(self, path: Path | None, config: dict[str, Any], *, resume: bool) -> None:
-        self._path = path
+        self._path, self._config = path, config
         if path is None:
             return
         if resume:
             _check_same(_read_config(path), config, path)
             return
-        if (path / _CHECKPOINTS).exists():
+        if any((path / _CHECKPOINTS).glob("*/*")):
             raise SettingError(
                 f"{path} holds an unfinished run",
                 "an empty folder, or a finished run (which is replaced)",
                 f'resume="{path}" (--resume {path}) to go on, or remove the folder',
             )
-        # Not beside the files of a finished run, which stay whole until this one is saved.
-        write_bytes(path / _CHECKPOINTS / _CONFIG, to_json(config))
 
     @property
     def finished(self) -> bool:
@@ -59,6 +57,11 @@ class RunFolder:
         """Write a checkpoint, then drop the older ones of its stage."""
         if self._path is None:
             return
+        # Not beside the files of a finished run, which stay whole until this one is saved, and
+        # not before there is something to go on from.
+        config = self._path / _CHECKPOINTS / _CONFIG
+        if not config.exists():
+            write_bytes(config, to_json(self._config))
         place = self._path / _CHECKPOINTS / str(round_)
         write_folder(place / f"{stage}-{number}", files)
         for older in _numbered(place, stage):

@@ -257,7 +257,11 @@ def describe_trainer(trainer: Trainer) -> str:
     """Return a trainer's name, and its settings where they are not the usual ones."""
     fields = vars(trainer).items()
     usual = vars(TRAINERS[trainer.name]()) if trainer.name in TRAINERS else {}
-    odd = [f"{name}={value}" for name, value in fields if usual.get(name) != value]
+    odd = [
+        f"{name}={getattr(value, '__name__', value)}"
+        for name, value in fields
+        if usual.get(name) != value
+    ]
     return ",".join([trainer.name, *odd])
 
 

@@ -1,18 +1,24 @@
 """What the student sees of what the expert sees."""
 
+import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
 from fdtasil.demonstrations import Answers, Demonstrations
 from fdtasil.errors import SettingError
+from fdtasil.onnx_files import read_model
 from fdtasil.rollouts import Policy
 
-__all__ = ["StudentObservation", "View", "describe_view"]
+__all__ = ["COLUMNS", "StudentObservation", "View", "columns_of", "describe_view"]
 
 StudentObservation = Sequence[int] | Callable[[np.ndarray], np.ndarray]
 """Indices of the coordinates that the student sees, or (B, n) -> (B, k)."""
+
+COLUMNS = "fdtasil.observation_columns"
+"""Metadata entry of an exported student that sees some coordinates only."""
 
 _SAME = 1e-4  # relative; beyond the rounding of float32, below any nonlinearity worth the name
 
@@ -50,13 +56,9 @@ class View:
             return View(lambda rows: rows, None, n, np.ones(n, bool))
         if callable(student_obs):
             return _from_function(student_obs, states)
-        columns = tuple(int(index) for index in student_obs)
+        columns = _indices(student_obs)
         if not columns or not all(0 <= index < n for index in columns):
-            raise SettingError(
-                f"student_obs={student_obs!r}",
-                f"indices from 0 to {n - 1}, at least one",
-                "write for example student_obs=range(10)",
-            )
+            raise _not_indices(student_obs, f"indices from 0 to {n - 1}, at least one")
         seen = np.isin(np.arange(n), columns)
         return View(lambda rows: rows[:, list(columns)], columns, len(columns), seen)
 
@@ -86,10 +88,12 @@ class View:
         if self.size == states.shape[1] and np.array_equal(self.look(states), states):
             return whole
         centres, moved = self.look(states), whole.displacements[whole.numbers]
-        steps = [self._step(states, centres, offset * moved) / offset for offset in offsets or [1]]
+        # Exact derivatives have no offsets: a view that is linear keeps them too.
+        sides = offsets or (1.0, -1.0)
+        steps = [self._step(states, centres, offset * moved) / offset for offset in sides]
         if not all(np.allclose(steps[0], step, rtol=0.01, atol=_SAME) for step in steps[1:]):
             raise SettingError(
-                "student_obs is a curved function, and the stencil has points on both sides",
+                "student_obs is a curved function, and the derivatives are exact or central",
                 "a linear function, indices, or the forward stencil",
                 'write for example probes="sphere:10,forward"',
             )
@@ -103,13 +107,37 @@ class View:
         return seen.reshape(*points.shape[:2], -1) - centres[:, None, :]
 
 
+def columns_of(policy: object) -> tuple[int, ...] | None:
+    """Return the columns that an exported student's file says it sees, or None."""
+    if not isinstance(policy, (str, Path)) or Path(policy).suffix != ".onnx":
+        return None
+    model, _ = read_model(Path(policy))
+    texts = {entry.key: entry.value for entry in model.metadata_props}
+    columns = texts.get(COLUMNS)
+    return None if columns is None else tuple(int(column) for column in columns.split(","))
+
+
 def describe_view(student_obs: StudentObservation | None) -> tuple[int, ...] | str | None:
     """Return a view as it is written into a configuration."""
     if student_obs is None:
         return None
     if callable(student_obs):
         return f"the function {getattr(student_obs, '__name__', type(student_obs).__name__)}"
-    return tuple(int(index) for index in student_obs)
+    return _indices(student_obs)
+
+
+def _indices(student_obs: Sequence[int]) -> tuple[int, ...]:
+    try:
+        mask = np.asarray(student_obs)
+        chosen = np.flatnonzero(mask) if mask.dtype == bool else student_obs
+        return tuple(operator.index(index) for index in chosen)
+    except TypeError:
+        raise _not_indices(student_obs, "integers, a boolean mask, or a function") from None
+
+
+def _not_indices(student_obs: object, expected: str) -> SettingError:
+    example = "write for example student_obs=range(10)"
+    return SettingError(f"student_obs={student_obs!r}", expected, example)
 
 
 def _from_function(function: Callable[[np.ndarray], np.ndarray], states: np.ndarray) -> View:

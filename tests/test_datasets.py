@@ -86,7 +86,10 @@ def seen(observations):
     return observations[:, :4]
 
 
-@pytest.mark.parametrize("student_obs", [range(4), seen, (3, 1, 0, 2)])
+MASK = np.array([True, True, True, True, False])
+
+
+@pytest.mark.parametrize("student_obs", [range(4), seen, (3, 1, 0, 2), MASK])
 @pytest.mark.parametrize("trainer", ["bc", "dagger", "dart"])
 def test_the_student_sees_less(student_obs, trainer, linear):
     quick = {**QUICK, "episodes": 3}
@@ -122,7 +125,17 @@ def test_a_curved_function_needs_the_forward_stencil(linear):
 
 
 @pytest.mark.parametrize(
-    "wrong", [[5], [-1], [], lambda x: x[:2], lambda x: x - x.mean(axis=0), lambda x: x[:, 0]]
+    "wrong",
+    [
+        [5],
+        [-1],
+        [],
+        [0.5],
+        slice(2),
+        lambda x: x[:2],
+        lambda x: x - x.mean(axis=0),
+        lambda x: x[:, 0],
+    ],
 )
 def test_a_wrong_view_is_refused(wrong):
     states = np.random.default_rng(0).standard_normal((9, 5)).astype(np.float32)
@@ -136,6 +149,36 @@ def test_a_chosen_view_survives_saving(linear, tmp_path):
     assert again.view.columns == (3, 0)
     rows = result.demonstrations.observations
     assert np.array_equal(again.student.act(again.view.look(rows)), result.student.act(rows[:, [3, 0]]))  # fmt: skip  # noqa: E501
+
+
+def test_a_student_that_sees_less_is_judged_from_its_file(linear, tmp_path):
+    result = fdtasil.distill(linear, TOY, 3, student_obs=[0, 1, 2, 3], **QUICK)
+    path = result.to_onnx(tmp_path / "student.onnx")
+    found = fdtasil.evaluate(path, linear, TOY, episodes=2, horizon=20)
+    assert found.normalized_return == pytest.approx(result.evaluation.normalized_return, abs=1e-3)
+    judged = fdtasil.evaluate(
+        result.student, linear, TOY, episodes=2, horizon=20, student_obs=[0, 1, 2, 3]
+    )
+    assert judged.normalized_return == pytest.approx(found.normalized_return, abs=1e-3)
+
+
+def test_a_function_as_view_is_given_again_to_load(linear, tmp_path):
+    result = fdtasil.distill(linear, TOY, 3, student_obs=seen, **QUICK)
+    folder = result.save(tmp_path)
+    again = fdtasil.Distilled.load(folder, student_obs=seen)
+    assert again.onnx_bytes() == result.onnx_bytes()
+    with pytest.raises(SettingError, match="the function seen"):
+        fdtasil.Distilled.load(folder).onnx_bytes()
+
+
+def test_what_is_not_used_is_refused(run, quick):
+    with pytest.raises(SettingError, match="trainer='dagger'"):
+        fdtasil.distill(demonstrations=run, trainer="dagger")
+    with pytest.raises(SettingError, match="stored answers"):
+        fdtasil.distill(demonstrations=run, probes="basis,central")
+    same = quick.report["probes"]
+    result = fdtasil.distill(demonstrations=run, probes=same, hidden=4, steps=5)
+    assert result.report["probes"] == same
 
 
 def test_a_twin_is_probed_too(tmp_path):

@@ -28,7 +28,7 @@ def linear_task(states=200, n=6, m=2, spec=None):
     expert = load_expert(lambda rows: rows @ gain.T)
     number, actions = np.zeros(states, np.int32), expert.ask(observations, "label")
     demonstrations = Demonstrations(
-        observations, actions, number, number, actions, np.zeros(states)
+        observations, actions, number, number, actions, np.zeros(states), number > 0
     )
     if spec is None:
         return demonstrations, None, None
@@ -86,7 +86,7 @@ def test_the_cost_of_a_step_does_not_grow_with_the_stored_probes():
     """50 stored probes against none, in turn in one process: the issue's bound is 3."""
     sizes = {"n": 17, "m": 6}
     cost = {}
-    with torch_settings():
+    with torch_settings(torch.device("cpu")):
         for spec in (None, "50") * 3:
             demonstrations, probes, ask = linear_task(states=1000, spec=spec, **sizes)
             student = new_student(**sizes, hidden=(512, 512))
@@ -181,7 +181,7 @@ def test_torch_settings_are_put_back():
     torch.set_num_threads(2)
     torch.set_float32_matmul_precision("high")
     try:
-        with torch_settings(threads=1) as precision:
+        with torch_settings(torch.device("cpu"), threads=1) as precision:
             assert torch.get_num_threads() == 1
             assert precision == torch.get_float32_matmul_precision()
         assert torch.get_num_threads() == 2

@@ -2,7 +2,9 @@
 
 import numpy as np
 import pytest
+import torch
 from conftest import GAIN, QUICK, TOY, mlp_onnx
+from toy_environments import Integrator
 
 import fdtasil
 from fdtasil.environments import Boxes
@@ -67,3 +69,73 @@ def test_an_expert_of_another_environment_is_refused_by_its_sizes(tmp_path):
     path = mlp_onnx(tmp_path / "e.onnx", sizes=(7, 8, 2))
     with pytest.raises(ExpertError, match="wants 7 observations, the environment gives 5"):
         fdtasil.distill(path, TOY, **QUICK)
+
+
+# --- what a review found, and must not come back
+
+
+def test_another_width_than_the_environments_is_refused(tmp_path, linear):
+    path = mlp_onnx(tmp_path / "e.onnx", extra_outputs={"value": 1})
+    with pytest.raises(ExpertError, match="has 1 actions, the environment has 2"):
+        fdtasil.distill(path, TOY, 0, output="value", **QUICK)
+    narrow = fdtasil.Expert(lambda rows: rows[:, :1], "narrow", action_size=1)
+    with pytest.raises(ExpertError, match="has 1 actions, the environment has 2"):
+        fdtasil.distill(narrow, TOY, 0, **QUICK)
+
+
+def test_a_factory_that_hands_out_one_environment_is_used_one_episode_at_a_time(linear):
+    one = Integrator()
+    shared = fdtasil.distill(linear, lambda: one, 2, **QUICK)
+    fresh = fdtasil.distill(linear, Integrator, 2, **QUICK)
+    found, expected = (run.demonstrations.observations for run in (shared, fresh))
+    assert np.allclose(found, expected, atol=1e-5)
+
+
+def test_a_half_bounded_action_does_not_switch_the_checks_off():
+    boxes = Boxes(5, np.full(2, -np.inf, np.float32), np.ones(2, np.float32))
+    rows = np.random.default_rng(0).standard_normal((16, 5)).astype(np.float32)
+    with pytest.raises(ExpertError, match="asked twice differs"):
+        check_expert(load_expert(FAULTS["stochastic"][0]), rows, boxes)
+
+
+def test_a_failed_gate_leaves_the_folder_free(tmp_path, linear):
+    with pytest.raises(ExpertError):
+        fdtasil.distill(FAULTS["stochastic"][0], TOY, 1, out=tmp_path / "run", **QUICK)
+    assert fdtasil.distill(linear, TOY, 1, out=tmp_path / "run", **QUICK).evaluation
+
+
+def test_a_stable_baselines3_policy_is_asked_through_predict():
+    class Scaled(torch.nn.Module):
+        def forward(self, observations):
+            """In [-1, 1], before scaling."""
+            return torch.tanh(observations[:, :2])
+
+        def predict(self, observation, state=None, episode_start=None, deterministic=False):
+            return 2 * np.tanh(observation[:, :2]), None
+
+    rows = np.random.default_rng(0).standard_normal((16, 5)).astype(np.float32)
+    answers = load_expert(Scaled(), 5, 2).ask(rows, "act")
+    assert np.allclose(answers, 2 * np.tanh(rows[:, :2]))
+
+
+def test_a_predict_without_options_is_a_predict():
+    class Regressor:
+        def predict(self, rows):
+            return rows @ GAIN.T
+
+    rows = np.random.default_rng(0).standard_normal((16, 5)).astype(np.float32)
+    assert load_expert(Regressor(), 5, 2).ask(rows, "act").shape == (16, 2)
+
+
+def test_an_expert_worse_than_chance_has_no_share():
+    def idle(observations):
+        return np.zeros((len(observations), 1))
+
+    def spin(observations):
+        return 2 * np.sign(observations[:, 2:3]) + 0.0
+
+    with pytest.warns(FdtasilWarning, match="not above"):
+        found = fdtasil.evaluate(idle, spin, "Pendulum-v1", episodes=3, horizon=100)
+    assert found.normalized_return is None
+    assert found.ci95 is None
+    assert "n/a" in str(found)

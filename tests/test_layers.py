@@ -17,6 +17,7 @@ ORDER = [
     "rounds",
     "runfolder",
     "configuration",
+    "calibration",
     "presets",
     "trainers",
     "figures",

@@ -22,7 +22,7 @@ def smooth_expert(n=6, m=3):
 def batch_of(module, spec, states, order=1):
     """The whole stencil of every state, and the stencil's gain."""
     probes = PRESETS["standard"].complete(Probes.parse(spec)).with_order(order)
-    expert = load_expert(module)
+    expert = load_expert(module, states.shape[1])
     random = np.random.default_rng(0)
     answers = ask_probes(expert, states, probes, statistics(states), random, order)
     batch = Minibatch(

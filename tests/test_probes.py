@@ -76,6 +76,7 @@ def test_every_stencil_is_exact_on_a_line_and_of_its_order_on_a_parabola(stencil
         "sphere:3,resample,radius=0.1,raw",
         "sphere:50,per_step=all",
         "basis,central,whitened,per_step=2",
+        "orthogonal:all,central",
     ],
 )
 def test_a_spec_reads_back(spec):
@@ -92,7 +93,8 @@ def test_short_specs():
 @pytest.mark.parametrize(
     "spec",
     [-1, 2.0, True, "spere:3", "sphere:0", "sphere:x", "basis:3", "sphere:3,radius=0",
-     "sphere:3,radius=nan", "sphere:3,odd", "sphere:3,per_step=0", "sphere:3,radius", ""],
+     "jacobian,central", "sphere:all", "sphere:3,radius=nan", "sphere:3,odd",
+     "sphere:3,per_step=0", "sphere:3,radius", ""],
 )  # fmt: skip
 def test_a_wrong_spec_is_refused_with_an_example(spec):
     with pytest.raises(SettingError, match="next step"):

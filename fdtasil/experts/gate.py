@@ -151,7 +151,8 @@ class _Probe:
         return Finding("action scale", measured, None)
 
     def _range(self) -> float:
-        bounded = (self.boxes.high - self.boxes.low)[np.isfinite(self.boxes.high)]
+        width = self.boxes.high - self.boxes.low
+        bounded = width[np.isfinite(width)]
         return float(bounded.min()) if bounded.size else max(1.0, float(np.ptp(self.answers)))
 
 

@@ -1,6 +1,8 @@
 """The kinds of experts, one function each, and the choice between them."""
 
+import copy
 import dataclasses
+import inspect
 from collections import Counter
 from collections.abc import Callable
 from pathlib import Path
@@ -21,7 +23,7 @@ __all__ = ["ExpertLike", "load_expert"]
 class Predictor(Protocol):
     """What stable-baselines3's agents, and many others, look like."""
 
-    def predict(self, observation: np.ndarray, *, deterministic: bool) -> Any:
+    def predict(self, observation: np.ndarray, /) -> Any:
         """Answer (B, n) observations with (B, m) actions, or a tuple that begins with them."""
         ...
 
@@ -63,41 +65,70 @@ def load_expert(
         'the function <lambda>'
     """
     if isinstance(source, Expert):
-        expert = dataclasses.replace(
-            source,
-            observation_size=source.observation_size or observation_size,
-            action_size=source.action_size or action_size,
-            queries=Counter(),
-        )
+        expert = dataclasses.replace(source, queries=Counter())
     elif isinstance(source, (str, Path)) and Path(source).suffix == ".zip":
         expert = _from_agent(Path(source), trust)
     elif isinstance(source, (str, Path)):
         expert = open_onnx(Path(source), observation_size, action_size, output)
-    elif isinstance(source, torch.nn.Module):
-        expert = _from_module(source, action_size)
+    elif isinstance(source, torch.nn.Module) and _is_the_policy(source, observation_size):
+        expert = _from_module(source)
     elif isinstance(source, Predictor):
-        expert = _from_predict(source, action_size)
+        expert = _from_predict(source)
     elif callable(source):
-        expert = Expert(source, f"the function {_name(source)}", observation_size, action_size)
+        expert = Expert(source, f"the function {_name(source)}")
     else:
         raise ExpertError(
             f"expert is a {type(source).__name__}",
             "an ONNX path, a torch module, an object with predict, or a function on batches",
             "wrap it: lambda observations: ...  ((B, n) -> (B, m))",
         )
+    expert = _sized(expert, observation_size, action_size)
     return expert if batch is None else _limited(expert, batch)
+
+
+def _sized(expert: Expert, observation_size: int | None, action_size: int | None) -> Expert:
+    """Return the expert with its sizes, where they are not others than those expected."""
+    said = (expert.observation_size, expert.action_size)
+    expected = (observation_size, action_size)
+    for role, ours, theirs in zip(("observations", "actions"), said, expected, strict=True):
+        if None not in (ours, theirs) and ours != theirs:
+            raise ExpertError(
+                f"{expert.name} has {ours} {role}, the environment has {theirs}",
+                "an expert of this environment",
+                "check the environment's version and options, and the output that was chosen",
+            )
+    return dataclasses.replace(
+        expert, observation_size=said[0] or expected[0], action_size=said[1] or expected[1]
+    )
 
 
 def _from_agent(path: Path, trust: Trust) -> Expert:
     agent = read_agent(path, trust=trust)
-    expert = _from_module(agent.module, len(agent.action_low))
     return dataclasses.replace(
-        expert, name=path.name, observation_size=agent.observation_size, sha256=agent.sha256
+        _from_module(agent.module),
+        name=path.name,
+        observation_size=agent.observation_size,
+        action_size=len(agent.action_low),
+        sha256=agent.sha256,
     )
 
 
-def _from_module(module: torch.nn.Module, action_size: int | None) -> Expert:
-    module.eval()
+def _is_the_policy(module: torch.nn.Module, observation_size: int | None) -> bool:
+    """Whether calling a module is asking it: stable-baselines3's policies scale in `predict`."""
+    if not isinstance(module, Predictor):
+        return True
+    if observation_size is None:
+        return False
+    rows = np.random.default_rng(0).standard_normal((8, observation_size)).astype(np.float32)
+    try:
+        called, asked = _from_module(module).answer(rows), _from_predict(module).answer(rows)
+    except (AttributeError, RuntimeError, TypeError, ValueError):
+        return False
+    return np.shape(called) == np.shape(asked) and np.allclose(called, asked, atol=1e-5)
+
+
+def _from_module(given: torch.nn.Module) -> Expert:
+    module = copy.deepcopy(given).eval()  # the caller's may go on training
     place = next((p for p in module.parameters()), torch.zeros(()))
 
     def answer(observations: np.ndarray) -> np.ndarray:
@@ -105,15 +136,17 @@ def _from_module(module: torch.nn.Module, action_size: int | None) -> Expert:
             batch = torch.from_numpy(observations).to(place.device, place.dtype)
             return module(batch).float().cpu().numpy()
 
-    name = f"the torch module {type(module).__name__}"
-    return Expert(answer, name, action_size=action_size, module=module)
+    return Expert(answer, f"the torch module {type(module).__name__}", module=module)
 
 
-def _from_predict(source: Predictor, action_size: int | None) -> Expert:
+def _from_predict(source: Predictor) -> Expert:
     name = f"{type(source).__name__}.predict"
+    # scikit-learn's predict takes the batch alone; stable-baselines3's is stochastic by default.
+    parameters = inspect.signature(source.predict).parameters
+    options = {"deterministic": True} if "deterministic" in parameters else {}
 
     def answer(observations: np.ndarray) -> np.ndarray:
-        result = source.predict(observations, deterministic=True)
+        result = source.predict(observations, **options)
         if not isinstance(result, tuple):
             return result
         actions, state = result
@@ -125,7 +158,7 @@ def _from_predict(source: Predictor, action_size: int | None) -> Expert:
             )
         return actions
 
-    return Expert(answer, name, action_size=action_size)
+    return Expert(answer, name)
 
 
 def _limited(expert: Expert, batch: int) -> Expert:

@@ -118,8 +118,11 @@ def _could_be_actions(entry: "onnxruntime.NodeArg", action_size: int | None) -> 
 def _answer(model: "onnx.ModelProto", session: "Session", output: str, n: int) -> Answer:
     """Return the fastest way to ask that gives the answers of single rows."""
     if is_batched(session):
-        return lambda rows: run_session(session, output, rows)
-    size = session.get_inputs()[0].shape[0]
+        if _takes_batches(session, output, n):
+            return lambda rows: run_session(session, output, rows)
+        size = 1
+    else:
+        size = session.get_inputs()[0].shape[0]
 
     def in_turn(rows: np.ndarray) -> np.ndarray:
         padded = np.concatenate([rows, np.zeros((-len(rows) % size, n), np.float32)])
@@ -138,6 +141,15 @@ def _answer(model: "onnx.ModelProto", session: "Session", output: str, n: int) -
         return run_session(free, output, rows)
 
     return at_once if _agree(at_once, in_turn, n) else _slow(in_turn, size, n)
+
+
+def _takes_batches(session: "Session", output: str, n: int) -> bool:
+    """Whether a free batch dimension is true: a constant inside the graph may hold another."""
+    try:
+        answers = run_session(session, output, np.zeros((3, n), np.float32))
+    except Exception:  # onnxruntime has its own
+        return False
+    return answers.ndim != 2 or len(answers) == 3
 
 
 def _agree(at_once: Answer, in_turn: Answer, n: int) -> bool:
