@@ -25,7 +25,8 @@ class Calibration:
     Attributes:
         regime: "smooth", "noisy" (a derivative exists above a noise that differences at small
             radii show), or "steps" (no radius has one).
-        noise_floor: Root mean square change of the action at the smallest radius.
+        noise_floor: Root mean square error of an action, from second differences at the smallest
+            radius, where nothing but rounding and noise is left of them.
         radius: Suggested, in standard deviations of each coordinate.
         stencil: Suggested, "forward" or "central".
         similarity: (10,) secant similarity at each radius and a quarter of it; the first is NaN.
@@ -61,14 +62,16 @@ def calibrate(
     signs = np.array([1.0, -1.0])[None, None, :, None]
     moved = rays[:, None, None, :] * _RADII[None, :, None, None] * signs
     points = (observations[rows][:, None, None, :] + moved).astype(np.float32)
+    centres = expert.ask(observations[rows], "check").astype(np.float64)
     answers = expert.ask(points.reshape(-1, len(scale)), "check")
     values = answers.reshape(_RAYS, len(_RADII), 2, -1).astype(np.float64)
     secants = (values[:, :, 0] - values[:, :, 1]) / (2 * _RADII[None, :, None])
     similarity = np.append(np.nan, _similarity(secants[:, 1:], secants[:, :-1]))
-    floor = float(np.sqrt(((values[:, 0, 0] - values[:, 0, 1]) ** 2).mean() / 2))
+    second = values[:, 0, 0] + values[:, 0, 1] - 2 * centres
+    floor = float(np.sqrt((second**2).mean() / 6))
     regime, radius = _judge(similarity)
     stencil = "central" if regime != "smooth" else "forward"
-    return Calibration(regime, floor, radius, stencil, similarity, _RADII, len(answers))
+    return Calibration(regime, floor, radius, stencil, similarity, _RADII, len(answers) + _RAYS)
 
 
 def _similarity(wide: np.ndarray, narrow: np.ndarray) -> np.ndarray:

@@ -17,7 +17,7 @@ from fdtasil.demonstrations import statistics
 from fdtasil.distilled import Distilled
 from fdtasil.environments import EnvironmentPool, resolve_horizon
 from fdtasil.errors import FdtasilError, SettingError
-from fdtasil.evaluation import interval_text, score_text
+from fdtasil.evaluation import interval_text, random_behaviour, score_text
 from fdtasil.experts import load_expert
 from fdtasil.experts.gate import examine_expert
 from fdtasil.pipeline import distill, evaluate
@@ -28,6 +28,7 @@ from fdtasil.storage import to_json, write_bytes
 
 __all__ = ["COMMANDS", "main"]
 
+CHANCE = "  (no worse than the expert: does it belong to this environment and version?)"
 COMMAND = "command.json"
 """File of a run's folder with the arguments that `fdtasil distill` was called with."""
 
@@ -65,6 +66,8 @@ def inspect_expert(
         opened = load_expert(expert, boxes.observation_size, boxes.action_size, output=output)
         starts = episode_seeds(seed, "evaluation", 0, episodes)
         recorded = rollout(follow(opened.policy("act")), pool, starts, length)
+        noise = [generator(seed, "random actions", episode) for episode in range(episodes)]
+        chance = rollout(random_behaviour(pool), pool, starts, length, noise).returns.mean()
         visited = recorded.observations[recorded.valid]
         spread = np.linspace(0, len(visited) - 1, 32).astype(int)
         findings = examine_expert(opened, visited[spread], boxes)
@@ -82,6 +85,7 @@ def inspect_expert(
         ("noise floor", f"{found.noise_floor:.1e} of the action, root mean square"),
         ("suggested radius", f"{found.radius:.2g} standard deviations, {found.stencil} stencil"),
         ("return", f"{returns.mean():.1f} +- {returns.std():.1f} over {episodes} episodes"),
+        ("random actions", f"{chance:.1f}{CHANCE if returns.mean() <= chance else ''}"),
         ("ended early", f"{falls} of {episodes}, of at most {length} steps"),
     ]
     print("\n".join(f"{name:20}{value}" for name, value in rows))

@@ -1,0 +1,32 @@
+"""The ladder of radii tells smooth, noisy and step-like experts apart."""
+
+import numpy as np
+import pytest
+from conftest import mlp_onnx
+
+from fdtasil.calibration import calibrate
+from fdtasil.demonstrations import statistics
+from fdtasil.experts import load_expert
+
+STATES = np.random.default_rng(0).standard_normal((200, 5)).astype(np.float32)
+NOISE = np.random.default_rng(1)
+EXPERTS = {
+    "smooth": lambda clean: clean,
+    "noisy": lambda clean: lambda x: clean(x) + 1e-3 * NOISE.standard_normal((len(x), 2)),
+    "steps": lambda clean: lambda x: np.sign(clean(x)),
+}
+
+
+@pytest.mark.parametrize("regime", EXPERTS)
+def test_regimes_are_told_apart(regime, tmp_path):
+    clean = load_expert(mlp_onnx(tmp_path / "e.onnx", sizes=(5, 16, 16, 2))).answer
+    expert = load_expert(EXPERTS[regime](clean))
+    found = calibrate(expert, STATES, statistics(STATES), np.random.default_rng(0))
+    assert found.regime == regime
+    assert found.stencil == ("forward" if regime == "smooth" else "central")
+    assert 0.05 < found.radius < 1
+    assert found.queries == expert.queries["check"] == 48 * 21
+    if regime == "noisy":
+        assert found.noise_floor == pytest.approx(1e-3, rel=0.3)
+    if regime == "smooth":
+        assert found.noise_floor < 1e-6
