@@ -54,8 +54,11 @@ def _room(path: Path) -> str:
 def _imported_rooms(path: Path) -> set[str]:
     found = set()
     for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("fdtasil."):
-            found.add(node.module.split(".")[1])
+        names = [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+        if isinstance(node, ast.ImportFrom):
+            module = node.module or ""
+            names = [f"fdtasil.{a.name}" for a in node.names] if module == "fdtasil" else [module]
+        found |= {name.split(".")[1] for name in names if name.startswith("fdtasil.")}
     return found
 
 

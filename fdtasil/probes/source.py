@@ -1,177 +1,17 @@
-"""Where to probe the expert, how to difference it, and when to ask again.
-
-Every design lowers to the same small thing: a bank of displacements and, for each state, the
-numbers of the rows of the bank that it is probed along. Nothing else knows which design it was.
-"""
+"""A derivative source: directions, stencil, distance, and when to ask again."""
 
 import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal, Protocol
+from typing import Literal
 
 import numpy as np
 
 from fdtasil.errors import SettingError
+from fdtasil.probes.directions import DIRECTIONS, Directions, OrthogonalFrames, RandomSphere
+from fdtasil.probes.stencils import CENTRAL, EXACT, FORWARD, STENCILS, Stencil
 
-__all__ = [
-    "CENTRAL",
-    "DIRECTIONS",
-    "EXACT",
-    "FORWARD",
-    "STENCILS",
-    "Directions",
-    "OrthogonalFrames",
-    "Probes",
-    "RandomSphere",
-    "StandardBasis",
-    "Stencil",
-]
-
-# Rows of a bank: with more states than this, states share directions, which costs no accuracy
-# (the states differ) and keeps Humanoid's 100,000 states from storing gigabytes of directions.
-_BANK = 4096
-
-
-class Directions(Protocol):
-    """Where to probe: unit vectors of the live coordinates."""
-
-    def count(self, dimension: int) -> int:
-        """Return how many directions each state is probed along."""
-        ...
-
-    def reach(self, dimension: int) -> float:
-        """Return the length of a step that moves the coordinates it moves by one unit each."""
-        ...
-
-    def draw(
-        self, rows: int, dimension: int, random: np.random.Generator
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return a bank (P, dimension) of unit rows and their numbers (rows, count) per state."""
-        ...
-
-
-@dataclass(frozen=True)
-class StandardBasis:
-    """One direction along each coordinate; all of them together are the whole Jacobian."""
-
-    def count(self, dimension: int) -> int:
-        """One for each coordinate."""
-        return dimension
-
-    def reach(self, dimension: int) -> float:
-        """One coordinate moves."""
-        return 1.0
-
-    def draw(
-        self, rows: int, dimension: int, random: np.random.Generator
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """See `Directions.draw`; nothing is random."""
-        numbers = np.broadcast_to(np.arange(dimension, dtype=np.int32), (rows, dimension))
-        return np.eye(dimension), numbers
-
-
-@dataclass(frozen=True)
-class RandomSphere:
-    """`probes` independent directions for each state, uniform on the sphere (TaSIL, appendix)."""
-
-    probes: int
-
-    def count(self, dimension: int) -> int:
-        """As many as asked for."""
-        return self.probes
-
-    def reach(self, dimension: int) -> float:
-        """All coordinates move."""
-        return dimension**0.5
-
-    def draw(
-        self, rows: int, dimension: int, random: np.random.Generator
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """See `Directions.draw`."""
-        size = min(rows * self.probes, max(_BANK, self.probes))
-        normal = random.standard_normal((size, dimension))
-        bank = normal / np.linalg.norm(normal, axis=1, keepdims=True)
-        # Neighbours in the bank are independent, so a run of them is a fresh sample for a state.
-        starts = np.arange(rows) * self.probes
-        if size < rows * self.probes:
-            starts = random.integers(size, size=rows)
-        return bank, _runs(starts, self.probes, size)
-
-
-@dataclass(frozen=True)
-class OrthogonalFrames:
-    """`probes` directions for each state, taken from random orthonormal frames.
-
-    Less variance than independent directions, and none when `probes` is the number of
-    coordinates; more than that are taken from further frames.
-
-    Attributes:
-        probes: Directions for each state, or None for one whole frame.
-    """
-
-    probes: int | None = None
-
-    def count(self, dimension: int) -> int:
-        """As many as asked for, or one for each coordinate."""
-        return dimension if self.probes is None else self.probes
-
-    def reach(self, dimension: int) -> float:
-        """All coordinates move."""
-        return dimension**0.5
-
-    def draw(
-        self, rows: int, dimension: int, random: np.random.Generator
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """See `Directions.draw`."""
-        count = self.count(dimension)
-        frames_each = -(-count // dimension)
-        frames = min(rows * frames_each, max(_BANK // dimension, frames_each))
-        gaussian = random.standard_normal((frames, dimension, dimension))
-        orthogonal, triangular = np.linalg.qr(gaussian)
-        # The signs make the frames uniform (Haar); QR alone prefers some.
-        signs = np.sign(np.einsum("fii->fi", triangular))
-        bank = (orthogonal * signs[:, None, :]).transpose(0, 2, 1).reshape(-1, dimension)
-        first = random.integers(frames, size=rows)
-        within = random.integers(dimension, size=rows)
-        turn = within[:, None] + np.arange(count)
-        frame = (first[:, None] + np.arange(count) // dimension) % frames
-        return bank, (frame * dimension + turn % dimension).astype(np.int32)
-
-
-DIRECTIONS: dict[str, Callable[[int | None], Directions]] = {
-    "basis": lambda count: StandardBasis(),
-    "sphere": lambda count: RandomSphere(10 if count is None else count),
-    "orthogonal": lambda count: OrthogonalFrames(10 if count is None else count),
-    "jacobian": lambda count: OrthogonalFrames(),
-}
-
-
-@dataclass(frozen=True)
-class Stencil:
-    """How to difference along one direction: values at offsets, and their weights.
-
-    Attributes:
-        name: What to call it.
-        offsets: Multiples of the step at which the function is asked, the centre apart.
-        weights: Weight of the value at each offset in the first difference.
-        centre: Weight of the value at the centre, which is known already.
-        second: Weights of the values, and last that of the centre, in the second difference;
-            None where the stencil has none.
-        exact: Whether the derivative is analytic, and no value is asked at all.
-    """
-
-    name: str
-    offsets: tuple[float, ...]
-    weights: tuple[float, ...]
-    centre: float
-    second: tuple[float, ...] | None = None
-    exact: bool = False
-
-
-FORWARD = Stencil("forward", (1.0,), (1.0,), -1.0)
-CENTRAL = Stencil("central", (1.0, -1.0), (0.5, -0.5), 0.0, (1.0, 1.0, -2.0))
-EXACT = Stencil("exact", (), (), 0.0, exact=True)
-STENCILS = {stencil.name: stencil for stencil in (FORWARD, CENTRAL, EXACT)}
+__all__ = ["Probes"]
 
 
 @dataclass(frozen=True)
@@ -214,11 +54,6 @@ class Probes:
             )
         if self.space not in (None, "whitened", "raw"):
             raise SettingError(f"space={self.space!r}", '"whitened" or "raw"', "choose one")
-        if (
-            getattr(self.directions, "probes", 1) is not None
-            and not getattr(self.directions, "probes", 1) > 0
-        ):
-            raise SettingError(f"{self.directions}", "a positive number of probes", _EXAMPLES)
         if (self.stencil is EXACT) and self.directions != OrthogonalFrames():
             raise SettingError(
                 f"the exact stencil with {self.directions}",
@@ -367,7 +202,3 @@ def _parse_option(option: str, spec: str) -> dict[str, object]:
         raise SettingError(
             f"probes={spec!r}: unknown option {option!r}", f"one of {known}", _EXAMPLES
         ) from None
-
-
-def _runs(starts: np.ndarray, length: int, size: int) -> np.ndarray:
-    return ((starts[:, None] + np.arange(length)) % size).astype(np.int32)

@@ -1,0 +1,29 @@
+"""Where to probe the expert, how to difference it, and when to ask again.
+
+Every design lowers to the same small thing: a bank of displacements and, for each state, the
+numbers of the rows of the bank that it is probed along. Nothing else knows which design it was.
+"""
+
+from fdtasil.probes.directions import (
+    DIRECTIONS,
+    Directions,
+    OrthogonalFrames,
+    RandomSphere,
+    StandardBasis,
+)
+from fdtasil.probes.source import Probes
+from fdtasil.probes.stencils import CENTRAL, EXACT, FORWARD, STENCILS, Stencil
+
+__all__ = [
+    "CENTRAL",
+    "DIRECTIONS",
+    "EXACT",
+    "FORWARD",
+    "STENCILS",
+    "Directions",
+    "OrthogonalFrames",
+    "Probes",
+    "RandomSphere",
+    "StandardBasis",
+    "Stencil",
+]
