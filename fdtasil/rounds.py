@@ -14,7 +14,6 @@ from fdtasil.configuration import Configuration
 from fdtasil.datasets import Dataset
 from fdtasil.demonstrations import (
     Answers,
-    Demonstrations,
     Statistics,
     ask_probes,
     label,
@@ -172,8 +171,22 @@ class Rounds:
                 "an expert, or demonstrations with stored answers",
                 "pass the expert, or probes=0 for plain behaviour cloning",
             )
+        scales = self.scales
+        self._check_budget(
+            probes.queries(len(observations), int(scales.probed(probes.space).sum()), 1)
+        )
         random = generator(self.run.seed, "probes", *path)
-        return ask_probes(expert, observations, probes, self.scales, random, self.run.order)
+        return ask_probes(expert, observations, probes, scales, random, self.run.order)
+
+    def _check_budget(self, rows: int) -> None:
+        """Refuse to ask beyond the budget: early ends make a resampling source ask more often."""
+        asked, most = sum(self._ledger().values()), self.run.max_queries
+        if most is not None and asked + rows > most:
+            raise SettingError(
+                f"{asked:,} rows are asked, and {rows:,} more are due",
+                f"at most max_queries={most:,}",
+                "raise max_queries, or leave out resample",
+            )
 
     def _train(self, round_: int) -> None:
         """Train a fresh student on all demonstrations, as it sees them."""
@@ -192,7 +205,7 @@ class Rounds:
             self._restore_ledger(state["queries"])
         if saved is not None:
             resume = saved["fit.safetensors"]
-        pools = _Pools(self, view, seen, round_, asked_pool)
+        pools = _Pools(self, view, round_, asked_pool)
         total = run.fit.total_steps(len(seen))
         with self.stages.stage(f"training, round {round_}", total, "step") as move:
             hooks = Hooks(self._tell(round_, move), self._checkpoint(round_, pools))
@@ -287,10 +300,8 @@ class Rounds:
 class _Pools:
     """The expert's answers by number of the pool: those stored, then those of new directions."""
 
-    def __init__(
-        self, rounds: Rounds, view: View, seen: Demonstrations, round_: int, asked: int
-    ) -> None:
-        self._rounds, self._view, self._seen = rounds, view, seen
+    def __init__(self, rounds: Rounds, view: View, round_: int, asked: int) -> None:
+        self._rounds, self._view = rounds, view
         self._round, self._asked_before = round_, asked
         self.number = 0
 

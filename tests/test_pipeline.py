@@ -219,3 +219,17 @@ def test_the_papers_experts_are_copied_from_five_episodes(name, bar, apart, shar
             found.append(result.evaluation.normalized_return)
     assert np.mean(scores[10]) >= bar
     assert np.mean(scores[10]) > np.mean(scores[0]) + apart
+
+
+def test_a_resampling_source_stops_at_the_budget(linear, monkeypatch):
+    """Falls can make it ask more than predicted, so it is held to the budget as it goes."""
+    monkeypatch.setattr("fdtasil.configuration.Configuration.check_budget", lambda self: None)
+    asked = []
+
+    def counted(observations):
+        asked.append(len(observations))
+        return linear(observations)
+
+    with pytest.raises(SettingError, match="more are due"):
+        fdtasil.distill(counted, TOY, "sphere:2,resample", max_queries=500, **QUICK)
+    assert sum(asked) <= 500
