@@ -197,14 +197,11 @@ class Rounds:
         start = torch_generator(run.seed, "student", round_)
         student = Student(shape, scales.mean, scales.scale, data.low, data.high, start)
         saved = self.folder.load(round_, "training")
-        resume = None
-        asked_pool = -1
-        if saved is not None and self.expert is not None:
-            state = json.loads(saved["state.json"])
-            asked_pool = state["pool"]
-            self._restore_ledger(state["queries"])
+        resume, asked_pool = None, -1
         if saved is not None:
-            resume = saved["fit.safetensors"]
+            state = json.loads(saved["state.json"])
+            resume, asked_pool = saved["fit.safetensors"], state["pool"]
+            self._restore_ledger(state["queries"])
         pools = _Pools(self, view, round_, asked_pool)
         total = run.fit.total_steps(len(seen))
         with self.stages.stage(f"training, round {round_}", total, "step") as move:
@@ -245,8 +242,12 @@ class Rounds:
             if time.monotonic() < due:
                 return
             about = {"pool": pools.number, "queries": self._ledger()}
-            files = {"fit.safetensors": state.to_bytes(), "state.json": to_json(about)}
-            self.folder.save(round_, "training", state.step, files)
+            self.folder.save(
+                round_,
+                "training",
+                state.step,
+                lambda: {"fit.safetensors": state.to_bytes(), "state.json": to_json(about)},
+            )
             due = time.monotonic() + CHECKPOINT_SECONDS
 
         return checkpoint
@@ -268,8 +269,12 @@ class Rounds:
 
     def _keep_collected(self, round_: int) -> None:
         about = {"episodes": self.episodes, "counts": self.counts, "queries": self._ledger()}
-        files = {"demonstrations.npz": self.data.to_bytes(), "state.json": to_json(about)}
-        self.folder.save(round_, "collected", 0, files)
+        self.folder.save(
+            round_,
+            "collected",
+            0,
+            lambda: {"demonstrations.npz": self.data.to_bytes(), "state.json": to_json(about)},
+        )
 
     def _restore_collected(self, round_: int) -> bool:
         files = self.folder.load(round_, "collected")
@@ -283,8 +288,12 @@ class Rounds:
 
     def _keep_trained(self, round_: int) -> None:
         about = {"history": self.history, "steps": self.steps, "queries": self._ledger()}
-        files = {"student.safetensors": self.trained.to_bytes(), "state.json": to_json(about)}
-        self.folder.save(round_, "trained", 0, files)
+        self.folder.save(
+            round_,
+            "trained",
+            0,
+            lambda: {"student.safetensors": self.trained.to_bytes(), "state.json": to_json(about)},
+        )
 
     def _restore_trained(self, round_: int) -> bool:
         files = self.folder.load(round_, "trained")

@@ -3,6 +3,7 @@
 import json
 import shutil
 import warnings
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -53,8 +54,13 @@ class RunFolder:
             return False
         return (self._path / MANIFEST).exists()
 
-    def save(self, round_: int, stage: str, number: int, files: dict[str, bytes]) -> None:
-        """Write a checkpoint, then drop the older ones of its stage."""
+    def save(
+        self, round_: int, stage: str, number: int, files: Callable[[], dict[str, bytes]]
+    ) -> None:
+        """Write a checkpoint, then drop the older ones of its stage.
+
+        `files` is called only where there is a folder: making them copies all data of the run.
+        """
         if self._path is None:
             return
         # Not beside the files of a finished run, which stay whole until this one is saved, and
@@ -63,7 +69,7 @@ class RunFolder:
         if not config.exists():
             write_bytes(config, to_json(self._config))
         place = self._path / _CHECKPOINTS / str(round_)
-        write_folder(place / f"{stage}-{number}", files)
+        write_folder(place / f"{stage}-{number}", files())
         for older in _numbered(place, stage):
             if older.name != f"{stage}-{number}":
                 shutil.rmtree(older, ignore_errors=True)
