@@ -46,7 +46,7 @@ def from_folder(folder: Path) -> tuple[torch.nn.Module, dict[str, Any]]:
     training = json.loads((folder / "training.json").read_text())
     return ActorModule(folder / "actor.npz"), {
         "environment": training["environment"],
-        "algorithm": f"SAC ({training['library']})",
+        "algorithm": f"{training['algorithm']} ({training['library']})",
         "steps": training["best_evaluation"]["steps"],
         "seed": training["seed"],
         "settings": {k: v for k, v in training["settings"].items() if v is not None},

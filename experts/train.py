@@ -1,4 +1,4 @@
-"""Train an expert controller with SAC, resumably, and write its actor as plain arrays.
+"""Train an expert controller with SAC or TQC, resumably, and write its actor as plain arrays.
 
     python experts/train.py HalfCheetah-v5 --out runs/experts/HalfCheetah-v5
 
@@ -31,11 +31,11 @@ import math
 import shutil
 import time
 from dataclasses import asdict, dataclass, replace
+from importlib import import_module
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import numpy as np
-import stable_baselines3
 import torch
 from actor import check_actor, evaluate, extract_actor, load_actor, save_actor
 from gymnasium.wrappers import DtypeObservation
@@ -60,6 +60,7 @@ class Recipe:
     learning_starts: int = 10_000
     interval: int = 25_000  # steps between two evaluations, each followed by a checkpoint
     library: str = "sbx"
+    algorithm: str = "SAC"
 
 
 RECIPES = {
@@ -67,8 +68,9 @@ RECIPES = {
     "Walker2d-v5": Recipe(target=4000),
     # With gamma 0.99 Swimmer stays near 50: a stroke pays only well after it is made.
     "Swimmer-v5": Recipe(target=300, gamma=0.9999, steps=500_000),
-    "Ant-v5": Recipe(target=4000),
-    "Humanoid-v5": Recipe(target=5000),
+    # TQC's actor is SAC's; its quantile critics reach the same return in fewer steps.
+    "Ant-v5": Recipe(target=4000, algorithm="TQC"),
+    "Humanoid-v5": Recipe(target=5000, algorithm="TQC"),
     # Tiny, for tests: minutes to the best possible return, about 9360.
     "InvertedDoublePendulum-v5": Recipe(
         target=9300, stop_return=9300, steps=100_000, learning_starts=1_000, interval=2_500
@@ -81,13 +83,13 @@ FINAL_EVALUATION_SEED = 20_000  # other episodes than those the best actor was c
 PACKAGES = ("stable-baselines3", "sbx-rl", "torch", "jax", "gymnasium", "mujoco", "numpy")
 
 
-def load_library(name):
-    """The SAC class of a library; sbx is imported only when asked for, it needs jax."""
-    if name == "sb3":
-        return stable_baselines3.SAC
-    from sbx import SAC
-
-    return SAC
+def load_algorithm(recipe):
+    """The class that trains; sbx is imported only when asked for, it needs jax."""
+    module = {
+        "sbx": "sbx",
+        "sb3": "sb3_contrib" if recipe.algorithm == "TQC" else "stable_baselines3",
+    }
+    return getattr(import_module(module[recipe.library]), recipe.algorithm)
 
 
 def make_environments(environment_id, recipe, seed):
@@ -102,7 +104,7 @@ def make_environments(environment_id, recipe, seed):
 
 
 def new_model(environment_id, recipe, seed):
-    return load_library(recipe.library)(
+    return load_algorithm(recipe)(
         "MlpPolicy",
         make_environments(environment_id, recipe, seed),
         seed=seed,
@@ -124,9 +126,9 @@ def newest_checkpoint(out):
 def load_model(checkpoint, environment_id, recipe, seed):
     """The model of a checkpoint with its replay buffer, its random streams seeded afresh."""
     steps = int(checkpoint.name.removeprefix("checkpoint-"))
-    library = load_library(recipe.library)
+    algorithm = load_algorithm(recipe)
     environments = make_environments(environment_id, recipe, seed + steps)
-    model = library.load(checkpoint / "model.zip", env=environments, device="cpu")
+    model = algorithm.load(checkpoint / "model.zip", env=environments, device="cpu")
     model.set_random_seed(seed + steps)  # loading seeds with `seed`: the first episodes again
     load_replay(model, checkpoint.parent / "replay")
     return model
@@ -233,6 +235,7 @@ def new_record(environment_id, recipe, seed):
     return {
         "environment": environment_id,
         "library": recipe.library,
+        "algorithm": recipe.algorithm,
         "settings": asdict(recipe),
         "versions": installed_versions(),
         "seed": seed,

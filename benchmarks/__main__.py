@@ -1,0 +1,62 @@
+"""`python -m benchmarks list | run NAME | draw NAME`."""
+
+import argparse
+import sys
+from pathlib import Path
+
+import benchmarks
+from benchmarks.quality import QUALITY
+from benchmarks.runner import FIGURES, RESULTS, Benchmark, read_rows, results_of, run
+from fdtasil.storage import write_bytes
+
+BENCHMARKS: dict[str, Benchmark] = {b.name: b for b in (QUALITY,)}
+
+
+def main() -> int:
+    """Run the command line; exit code 1 where a cell failed."""
+    parser = argparse.ArgumentParser(prog="python -m benchmarks", description=benchmarks.__doc__)
+    commands = parser.add_subparsers(dest="command", required=True)
+    commands.add_parser("list", help="show the benchmarks, and how much of each is done")
+    running = commands.add_parser("run", help="run the cells that have no result yet")
+    running.add_argument("name", choices=BENCHMARKS)
+    running.add_argument("--quick", action="store_true", help="a smoke run of minutes")
+    running.add_argument("--workers", type=int, default=1, help="processes of one thread each")
+    running.add_argument("--backend", choices=("loky", "ray"), default="loky")
+    running.add_argument("--out", type=Path, default=RESULTS, help="folder of the results files")
+    drawing = commands.add_parser("draw", help="draw the figures and tables of a results file")
+    drawing.add_argument("name", choices=BENCHMARKS)
+    drawing.add_argument("--results", type=Path, default=RESULTS, help="folder of the results")
+    drawing.add_argument("--out", type=Path, default=FIGURES, help="folder of the figures")
+    arguments = parser.parse_args()
+    if arguments.command == "list":
+        return _list()
+    benchmark = BENCHMARKS[arguments.name]
+    if arguments.command == "draw":
+        return _draw(benchmark, arguments.results, arguments.out)
+    path = arguments.out / f"{benchmark.name}.jsonl"
+    cells = benchmark.cells(arguments.quick)
+    failed = run(benchmark, cells, path, workers=arguments.workers, backend=arguments.backend)
+    print(f"{benchmark.name}: {len(cells)} cells, {len(failed)} failed now; results in {path}")
+    return min(len(failed), 1)
+
+
+def _list() -> int:
+    for name, benchmark in BENCHMARKS.items():
+        done = len(results_of(read_rows(RESULTS / f"{name}.jsonl")))
+        print(f"{name:20}{done:5} of {len(benchmark.cells(False)):5} cells  {benchmark.about}")
+    return 0
+
+
+def _draw(benchmark: Benchmark, results: Path, out: Path) -> int:
+    rows = results_of(read_rows(results / f"{benchmark.name}.jsonl"))
+    if not rows:
+        print(f"no results of {benchmark.name} in {results}: run it first", file=sys.stderr)
+        return 1
+    for name, data in benchmark.draw(rows).items():
+        write_bytes(out / name, data)
+        print(out / name)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

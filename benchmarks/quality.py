@@ -1,0 +1,75 @@
+"""Do the defaults keep their promise: the expert's return, and never worse than plain cloning."""
+
+from collections.abc import Sequence
+
+from benchmarks.controllers import available
+from benchmarks.distillation import distil_cell
+from benchmarks.runner import Benchmark, Cell, Row
+from benchmarks.statistics import interval_text, paired_difference
+
+__all__ = ["QUALITY"]
+
+SEEDS = range(5)
+# Episodes and steps: the usual budget, little data, and the whole length of an episode.
+BUDGETS = ((5, 300), (2, 300), (1, 300), (5, 1000))
+PROBES = (10, 0)
+
+
+def cells(quick: bool) -> list[Cell]:
+    """Every expert, budget and seed, with and without probes."""
+    experts = available("HalfCheetah-v5") if quick else available()
+    return [
+        {"expert": e, "probes": p, "episodes": n, "horizon": t, "seed": seed}
+        for n, t in (BUDGETS[:1] if quick else BUDGETS)
+        for seed in (range(2) if quick else SEEDS)
+        for e in experts
+        for p in PROBES
+    ]
+
+
+def draw(rows: Sequence[Row]) -> dict[str, bytes]:
+    """One table: experts and budgets down, plain cloning and probes across."""
+    lines = [
+        "| expert | episodes x steps | plain cloning | 10 probes | paired difference, 95 % "
+        "| worst seed | survival, expert and student | seconds |",
+        "|---|---|---|---|---|---|---|---|",
+    ]
+    experts = list(dict.fromkeys(row["cell"]["expert"] for row in rows))
+    for episodes, horizon in BUDGETS:
+        for expert in experts:
+            mine = [
+                row
+                for row in rows
+                if (row["cell"]["expert"], row["cell"]["episodes"], row["cell"]["horizon"])
+                == (expert, episodes, horizon)
+            ]
+            lines += _line(mine, f"{expert} | {episodes} x {horizon}")
+    return {"quality.md": ("\n".join(lines) + "\n").encode()}
+
+
+def _line(rows: Sequence[Row], head: str) -> list[str]:
+    by_probes = {
+        probes: {
+            row["cell"]["seed"]: row["result"] for row in rows if row["cell"]["probes"] == probes
+        }
+        for probes in PROBES
+    }
+    ours, plain = (by_probes[probes] for probes in PROBES)
+    if len(ours.keys() & plain.keys()) < 2:
+        return []
+    score = {seed: result["normalized_return"] for seed, result in ours.items()}
+    base = {seed: result["normalized_return"] for seed, result in plain.items()}
+    mean, (low, high) = paired_difference(score, base)
+    survival = [
+        sum(result[name] for result in ours.values()) / len(ours)
+        for name in ("expert_survival", "survival")
+    ]
+    seconds = sum(result["train_seconds"] for result in ours.values()) / len(ours)
+    return [
+        f"| {head} | {interval_text(list(base.values()))} | {interval_text(list(score.values()))} "
+        f"| {mean:+.3f} [{low:+.3f}, {high:+.3f}] | {min(score.values()):.2f} "
+        f"| {survival[0]:.2f}, {survival[1]:.2f} | {seconds:.0f} |"
+    ]
+
+
+QUALITY = Benchmark("quality", __doc__ or "", cells, distil_cell, draw)

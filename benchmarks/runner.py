@@ -1,0 +1,150 @@
+"""Runs the cells of a benchmark: what is done is skipped, what fails is kept and shown."""
+
+import json
+import os
+import platform
+import subprocess
+import sys
+import time
+import traceback
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from joblib import Parallel, delayed, parallel_config
+from tqdm import tqdm
+
+from fdtasil.report import versions
+
+__all__ = ["Benchmark", "Cell", "Row", "read_rows", "results_of", "run"]
+
+HERE = Path(__file__).parent
+RESULTS = HERE / "results"
+FIGURES = HERE / "figures"
+
+Cell = Mapping[str, Any]
+"""One configuration with one seed, as plain JSON values; the row of a cell is found by it."""
+Row = Mapping[str, Any]
+"""`cell`, `result` or `error`, `seconds`, `versions`, `commit`, `machine`."""
+
+
+@dataclass(frozen=True)
+class Benchmark:
+    """One figure or table.
+
+    Attributes:
+        name: Of the results file and the command.
+        about: What it shows, in one sentence.
+        cells: Whether to be quick -> the cells, the most telling first.
+        run: A cell -> its result, as plain JSON values. Runs in a process of one thread.
+        draw: The rows that have a result -> files by name, for the folder of figures.
+        alone: Whether a cell measures time, and must not run beside another.
+    """
+
+    name: str
+    about: str
+    cells: Callable[[bool], Sequence[Cell]]
+    run: Callable[[Cell], dict[str, Any]]
+    draw: Callable[[Sequence[Row]], Mapping[str, bytes]]
+    alone: bool = False
+
+
+def run(
+    benchmark: Benchmark,
+    cells: Sequence[Cell],
+    path: Path,
+    *,
+    workers: int = 1,
+    backend: str = "loky",
+) -> list[Row]:
+    """Run the cells that have no result yet, and append their rows to the results file.
+
+    Args:
+        benchmark: What is run.
+        cells: Which cells.
+        path: The results file, one JSON object a line; made if it is not there.
+        workers: Processes at once, one thread each.
+        backend: joblib's: "loky" on this machine, "ray" on a Ray cluster.
+
+    Returns:
+        The rows of those cells that failed now.
+    """
+    done = {_key(row["cell"]) for row in read_rows(path) if "result" in row}
+    due = [cell for cell in cells if _key(cell) not in done]
+    path.parent.mkdir(parents=True, exist_ok=True)
+    failed = []
+    about = {"commit": _commit(), "versions": versions()}
+    with path.open("a") as file, _backend(backend):
+        rows = _rows(benchmark, due, 1 if benchmark.alone else workers)
+        for row in tqdm(rows, total=len(due), desc=benchmark.name, unit="cell", mininterval=5):
+            # The parent alone writes, whole lines at once: a kill loses the cells under way.
+            file.write(json.dumps({**row, **about}) + "\n")
+            file.flush()
+            if "error" in row:
+                failed.append(row)
+                tqdm.write(f"FAILED {json.dumps(row['cell'])}\n{row['error']}", file=sys.stderr)
+    return failed
+
+
+def read_rows(path: Path) -> list[Row]:
+    """Return the rows of a results file, without a last line that a kill cut short."""
+    rows = []
+    for line in path.read_text().splitlines() if path.exists() else []:
+        try:
+            rows.append(json.loads(line))
+        except ValueError:
+            continue
+    return rows
+
+
+def results_of(rows: Iterable[Row]) -> list[Row]:
+    """Return the newest row with a result of each cell."""
+    return list({_key(row["cell"]): row for row in rows if "result" in row}.values())
+
+
+def _rows(benchmark: Benchmark, cells: Sequence[Cell], workers: int) -> Iterable[Row]:
+    if workers == 1:
+        return (_timed(benchmark.run, cell) for cell in cells)
+    jobs = (delayed(_timed)(benchmark.run, cell) for cell in cells)
+    return Parallel(n_jobs=workers, return_as="generator_unordered", batch_size=1)(jobs)
+
+
+def _timed(function: Callable[[Cell], dict[str, Any]], cell: Cell) -> Row:
+    # Several processes of several threads each are many times slower than of one each.
+    os.environ["OMP_NUM_THREADS"] = "1"
+    started = time.perf_counter()
+    try:
+        outcome: dict[str, Any] = {"result": function(cell)}
+    except Exception:  # one failed cell must not stop the others; it is kept and shown
+        outcome = {"error": traceback.format_exc(limit=-4)}
+    seconds = round(time.perf_counter() - started, 2)
+    return {"cell": dict(cell), **outcome, "seconds": seconds, "machine": _machine()}
+
+
+def _backend(name: str) -> Any:
+    if name == "ray":
+        from ray.util.joblib import register_ray
+
+        register_ray()
+    return parallel_config(backend=name, inner_max_num_threads=1 if name == "loky" else None)
+
+
+def _key(cell: Cell) -> str:
+    return json.dumps(cell, sort_keys=True)
+
+
+def _machine() -> str:
+    model = platform.processor() or platform.machine()
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():
+        names = [line for line in cpuinfo.read_text().splitlines() if "model name" in line]
+        model = names[0].partition(":")[2].strip() if names else model
+    return f"{model}, {os.cpu_count()} cores"
+
+
+def _commit() -> str | None:
+    asked = subprocess.run(
+        ["git", "describe", "--always", "--dirty"], cwd=HERE, capture_output=True, text=True
+    )
+    return asked.stdout.strip() or None
