@@ -1,21 +1,47 @@
 """The one type that every kind of expert is turned into: a counted, checked black box."""
 
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, Protocol
 
 import numpy as np
 import torch
 
 from fdtasil.errors import ExpertError
 
-__all__ = ["Expert", "Purpose"]
+__all__ = ["Answer", "Expert", "Purpose", "RaisedElsewhere"]
 
 Purpose = Literal["check", "act", "label", "probe", "evaluate"]
 """Why a row was asked: gate, acting in rollouts, labels, probes, evaluation."""
 
-_CHUNK = 1024  # rows asked at once; a fixed size keeps onnxruntime's memory from growing
+Answer = Callable[[np.ndarray], np.ndarray]
+"""(B, n) float32 raw observations -> (B, m) actions in environment units."""
+
+CHUNK = 1024  # rows asked at once; a fixed size keeps onnxruntime's memory from growing
+
+
+class RaisedElsewhere(Exception):
+    """What an expert raised in another process, where the exception itself can't be sent.
+
+    Args:
+        kind: Its type's name.
+        message: Its text.
+    """
+
+    def __init__(self, kind: str, message: str) -> None:
+        super().__init__(message)
+        self.kind = kind
+
+
+class Workers(Protocol):
+    """Several that answer at once."""
+
+    def each(
+        self, ask: Callable[[np.ndarray, Answer], np.ndarray], batches: Sequence[np.ndarray]
+    ) -> list[np.ndarray]:
+        """Return `ask(batch, answer)` of every batch, in their order, whoever answers it."""
+        ...
 
 
 @dataclass(frozen=True)
@@ -31,6 +57,7 @@ class Expert:
         module: The same function as a differentiable torch module, or None; only the analytic
             reference (`probes="jacobian"`) uses it.
         chunk: Rows asked at once.
+        workers: Who answer chunks side by side instead of `answer`, or None; copies share them.
         queries: Rows answered so far, by purpose.
 
     Example:
@@ -40,13 +67,14 @@ class Expert:
         (array([2., 2., 2.], dtype=float32), {'probe': 3})
     """
 
-    answer: Callable[[np.ndarray], np.ndarray]
+    answer: Answer
     name: str
     observation_size: int | None = None
     action_size: int | None = None
     sha256: str | None = None
     module: torch.nn.Module | None = None
-    chunk: int = _CHUNK
+    chunk: int = CHUNK
+    workers: Workers | None = None
     queries: Counter[str] = field(default_factory=Counter)
 
     def ask(self, observations: np.ndarray, purpose: Purpose) -> np.ndarray:
@@ -65,24 +93,27 @@ class Expert:
         rows = np.ascontiguousarray(observations, np.float32)
         self.queries[purpose] += len(rows)
         starts = range(0, max(len(rows), 1), self.chunk)
-        # Each call gets a copy and its answer is copied: experts that write into their input
-        # or return their own buffer would otherwise change what is stored.
-        parts = [self._ask_chunk(rows[start : start + self.chunk].copy()) for start in starts]
-        return np.concatenate(parts)
+        chunks = [rows[start : start + self.chunk] for start in starts]
+        if self.workers is not None:
+            return np.concatenate(self.workers.each(self._ask_chunk, chunks))
+        return np.concatenate([self._ask_chunk(chunk, self.answer) for chunk in chunks])
 
     def policy(self, purpose: Purpose) -> Callable[[np.ndarray], np.ndarray]:
         """Return the expert as a policy whose rows are counted under `purpose`."""
         return lambda observations: self.ask(observations, purpose)
 
-    def _ask_chunk(self, rows: np.ndarray) -> np.ndarray:
+    def _ask_chunk(self, rows: np.ndarray, ask: Answer) -> np.ndarray:
         expected = f"({len(rows)}, {self.action_size or 'm'}) finite numbers"
         try:
-            answer = np.array(self.answer(rows), dtype=np.float32, order="C")
+            # Each call gets a copy and its answer is copied: experts that write into their input
+            # or return their own buffer would otherwise change what is stored.
+            answer = np.array(ask(rows.copy()), dtype=np.float32, order="C")
         except ExpertError:
             raise
         except Exception as error:
+            kind = error.kind if isinstance(error, RaisedElsewhere) else type(error).__name__
             raise ExpertError(
-                f"{self.name} raised {type(error).__name__} on {len(rows)} observations: {error}",
+                f"{self.name} raised {kind} on {len(rows)} observations: {error}",
                 expected,
                 "call it on such a batch on its own; experts answer (B, n) with (B, m)",
             ) from error

@@ -3,17 +3,20 @@
 import copy
 import dataclasses
 import inspect
+import warnings
 from collections import Counter
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 import torch
 
-from fdtasil.errors import ExpertError
-from fdtasil.experts.expert import Expert
+from fdtasil.errors import ExpertError, FdtasilWarning
+from fdtasil.experts.expert import CHUNK, Answer, Expert
 from fdtasil.experts.onnx_expert import open_onnx
+from fdtasil.experts.workers import BATCH, check_workers, with_processes, with_threads
 from fdtasil.sb3 import Trust, read_agent
 
 __all__ = ["ExpertLike", "load_expert"]
@@ -40,6 +43,9 @@ def load_expert(
     output: str | None = None,
     batch: int | None = None,
     trust: Trust = None,
+    workers: int = 0,
+    threads: bool = False,
+    timeout: float | None = None,
 ) -> Expert:
     """Open whatever answers observations with actions.
 
@@ -50,20 +56,28 @@ def load_expert(
         observation_size: n, where it is known; checked against the expert.
         action_size: m, where it is known; chooses among the outputs of an ONNX file.
         output: Name of the ONNX output that holds the actions.
-        batch: Rows asked at once, where the expert can't take any number; 1 asks row by row.
+        batch: Rows asked at once; 1 asks row by row. Left out, it is 1024, or 8 for each of
+            `workers`: equal batches give equal bytes, whatever the number of workers.
         trust: "pickle" lets stable-baselines3 load what can't be read from a zip without running
             code that is in it.
+        workers: Processes that answer side by side, for slow experts. They start at the first
+            question, hold a copy of the expert each, and compute on one thread.
+        threads: Use threads of this process instead, for experts that wait or let other threads
+            run.
+        timeout: Seconds that a batch may take; a process that hangs is ended. None is for ever.
 
     Returns:
         The expert, with an empty ledger.
 
     Raises:
-        ExpertError: If it can't be opened, or its sizes are others.
+        ExpertError: If it can't be opened or sent to another process, or its sizes are others.
+        SettingError: If workers, threads and timeout don't go together.
 
     Example:
         >>> load_expert(lambda observations: -observations[:, :2], action_size=2).name
         'the function <lambda>'
     """
+    check_workers(workers, threads, timeout)
     if isinstance(source, Expert):
         expert = dataclasses.replace(source, queries=Counter())
     elif isinstance(source, (str, Path)) and Path(source).suffix == ".zip":
@@ -83,7 +97,44 @@ def load_expert(
             "wrap it: lambda observations: ...  ((B, n) -> (B, m))",
         )
     expert = _sized(expert, observation_size, action_size)
-    return expert if batch is None else _limited(expert, batch)
+    if batch is None and workers and expert.chunk == CHUNK:
+        batch = BATCH
+    expert = expert if batch is None else _limited(expert, batch)
+    if not workers:
+        return expert
+    if threads:
+        return with_threads(expert, workers)
+    return with_processes(expert, _opener(source, expert, output, trust), workers, timeout)
+
+
+def _opener(
+    source: ExpertLike, expert: Expert, output: str | None, trust: Trust
+) -> Callable[[], Answer] | None:
+    """Return what opens a file again in another process; what is no file is sent as it is."""
+    if not isinstance(source, (str, Path)):
+        return None
+    sizes = expert.observation_size, expert.action_size
+    return partial(_open_again, Path(source).absolute(), *sizes, output, trust, expert.sha256)
+
+
+def _open_again(
+    place: str | Path,
+    observation_size: int | None,
+    action_size: int | None,
+    output: str | None,
+    trust: Trust,
+    sha256: str | None,
+) -> Answer:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FdtasilWarning)  # the caller has been told
+        expert = load_expert(place, observation_size, action_size, output=output, trust=trust)
+    if expert.sha256 != sha256:
+        raise ExpertError(
+            f"{place} has changed since it was opened",
+            f"sha256 {sha256}",
+            "leave the file as it is while it is asked, or open it again",
+        )
+    return expert.answer
 
 
 def _sized(expert: Expert, observation_size: int | None, action_size: int | None) -> Expert:

@@ -1,0 +1,106 @@
+"""A worker: batches come in by its standard input, answers go out by its standard output.
+
+It is run as a file, not imported as a part of fdtasil: importing the package loads torch, and a
+worker without it starts in a tenth of the time and memory. Nothing but the standard library is
+imported before the parent has said where modules lie.
+"""
+
+import ctypes
+import os
+import pickle
+import queue
+import signal
+import struct
+import sys
+import threading
+import traceback
+from collections.abc import Callable
+from typing import IO, Any
+
+__all__ = ["receive", "send"]
+
+_LENGTH = struct.Struct("<Q")
+_PARENT_DEATH = 1  # PR_SET_PDEATHSIG
+
+
+def send(stream: IO[bytes], message: Any) -> None:
+    """Write one message."""
+    data = pickle.dumps(message, protocol=pickle.HIGHEST_PROTOCOL)
+    stream.write(_LENGTH.pack(len(data)))
+    stream.write(data)
+    stream.flush()
+
+
+def receive(stream: IO[bytes]) -> bytes:
+    """Read one message, still pickled.
+
+    Raises:
+        EOFError: If the other side is gone.
+    """
+    length = stream.read(_LENGTH.size)
+    data = stream.read(_LENGTH.unpack(length)[0]) if len(length) == _LENGTH.size else b""
+    if not data:
+        raise EOFError
+    return data
+
+
+def main() -> None:
+    """Answer batches until the parent closes the pipe, or is no more."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to answer
+    _die_with_the_parent()
+    requests, replies = _private_streams()
+    inbox: queue.SimpleQueue[bytes] = queue.SimpleQueue()
+    threading.Thread(target=_read, args=(requests, inbox), daemon=True).start()
+    _serve(inbox, replies)
+
+
+def _die_with_the_parent() -> None:
+    """Have the kernel kill this process, even in code that never lets another thread run."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(_PARENT_DEATH, signal.SIGKILL)
+
+
+def _private_streams() -> tuple[IO[bytes], IO[bytes]]:
+    """Keep the two pipes to ourselves: what the expert prints goes to standard error."""
+    requests, replies = os.fdopen(os.dup(0), "rb"), os.fdopen(os.dup(1), "wb")
+    nothing = os.open(os.devnull, os.O_RDONLY)
+    os.dup2(nothing, 0)
+    os.dup2(2, 1)
+    sys.stdout = sys.stderr
+    return requests, replies
+
+
+def _read(requests: IO[bytes], inbox: "queue.SimpleQueue[bytes]") -> None:
+    """Hand messages over; end the process when the pipe ends, whatever it is busy with."""
+    try:
+        while True:
+            inbox.put(receive(requests))
+    finally:
+        os._exit(0)
+
+
+def _serve(inbox: "queue.SimpleQueue[bytes]", replies: IO[bytes]) -> None:
+    sys.path[:], parcel = pickle.loads(inbox.get())
+    import numpy as np  # only now is it known where modules lie
+
+    # The parcel is a function that opens the expert; pickle finds cloudpickle by itself.
+    outcome, answer = _attempt(lambda: pickle.loads(parcel)())
+    send(replies, (outcome, None if outcome == "done" else answer))
+    while True:
+        rows = pickle.loads(inbox.get())
+        send(replies, _attempt(lambda rows=rows: np.array(answer(rows), np.float32, order="C")))
+
+
+def _attempt(work: Callable[[], Any]) -> tuple[str, Any]:
+    """Return what the work returns, or plain strings: exceptions may fail to be pickled."""
+    try:
+        return "done", work()
+    except BaseException as error:  # SystemExit too: an expert has no say over the run
+        parts = [getattr(error, part, None) for part in ("found", "expected", "next_step")]
+        if None not in parts:  # one of fdtasil's, which need not be imported to be known
+            return "refused", parts
+        return "raised", (type(error).__name__, str(error), traceback.format_exc())
+
+
+if __name__ == "__main__":
+    main()
