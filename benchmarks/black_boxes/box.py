@@ -1,7 +1,7 @@
 """What a maker of black boxes is, and how what it made is measured."""
 
 from collections.abc import Callable, Iterator
-from contextlib import AbstractContextManager, contextmanager, nullcontext
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,12 +22,13 @@ class BlackBox:
         name: What to call it on the command line and in tables.
         about: One sentence on what it is and why it has no derivative.
         environment: Gymnasium id.
-        make: Folder for its files -> the expert (an ONNX path, a function, a URL), or a context
-            manager that yields it, where something must be ended afterwards.
+        make: Folder for its files -> the expert (an ONNX path, a function, an `Expert`).
         horizon: Steps of an episode.
-        episodes: Paired episodes of an evaluation; fewer where the expert is slow.
+        demonstrations: Episodes that it is distilled from.
         slow: Whether a row takes milliseconds.
         needs: Optional libraries that `make` imports.
+        serves: Whether `make` returns a context manager that yields the expert, since something
+            must be ended afterwards.
     """
 
     name: str
@@ -35,17 +36,17 @@ class BlackBox:
     environment: str
     make: Callable[[Path], Any]
     horizon: int = 300
-    episodes: int = 20
+    demonstrations: int = 5
     slow: bool = False
     needs: tuple[str, ...] = ()
+    serves: bool = False
 
     @contextmanager
     def open(self, folder: Path) -> Iterator[Any]:
         """Make the expert, and end what serves it afterwards."""
         folder.mkdir(parents=True, exist_ok=True)
         made = self.make(folder)
-        manager = made if isinstance(made, AbstractContextManager) else nullcontext(made)
-        with manager as expert:
+        with made if self.serves else nullcontext(made) as expert:
             yield expert
 
 
