@@ -6,8 +6,9 @@ and what has to be known besides (class names, the activation, the action bounds
 `trust="pickle"` hands the zip to stable-baselines3 instead; nothing else imports that library.
 """
 
-from fdtasil.sb3.agent import Agent, Trust, read_agent
+from fdtasil.sb3.agent import Agent, read_agent
 from fdtasil.sb3.export import export_sb3
 from fdtasil.sb3.logging import open_log
+from fdtasil.sb3.statistics import Trust
 
 __all__ = ["Agent", "Trust", "export_sb3", "open_log", "read_agent"]

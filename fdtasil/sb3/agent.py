@@ -2,23 +2,19 @@
 
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 from numpy.typing import ArrayLike
 from torch import nn
 
 from fdtasil.errors import ExpertError, SettingError
-from fdtasil.sb3.archive import Archive, read_archive, read_file
-from fdtasil.sb3.network import Clip, Normalise, Rescale, Statistics, build_network
-from fdtasil.sb3.recipes import Recipe, find_recipe, read_activation
+from fdtasil.sb3.archive import Archive, read_archive
+from fdtasil.sb3.network import Clip, Normalise, Rescale, build_network
+from fdtasil.sb3.recipes import Recipe, check_policy, find_recipe, read_activation
 from fdtasil.sb3.spaces import Bounds, given_bounds, read_bounds, read_size
-from fdtasil.storage import sha256
+from fdtasil.sb3.statistics import Trust, VecNormalizePath, check_trust, read_statistics
 
-__all__ = ["Agent", "Trust", "VecNormalizePath", "read_agent"]
-
-Trust = Literal["pickle"] | None
-VecNormalizePath = str | Path | Literal[False] | None
+__all__ = ["Agent", "read_agent"]
 
 
 @dataclass(frozen=True)
@@ -60,7 +56,8 @@ def read_agent(
     """Read an agent that stable-baselines3 saved, since its version 0.6, without unpickling.
 
     Args:
-        path: The zip of a SAC, TD3, DDPG, TQC, PPO, A2C or TRPO agent with an MLP policy.
+        path: The zip of a SAC, TD3, DDPG, TQC, PPO, A2C or TRPO agent with an MLP policy; its
+            ".zip" may be left out, as in stable-baselines3.
         trust: "pickle" to have stable-baselines3 load the zip. That runs any code that is in it,
             and is needed for gSDE, custom policies, feature extractors and activations, and for
             VecNormalize statistics.
@@ -82,22 +79,21 @@ def read_agent(
         agent = read_agent("agents/HalfCheetah-v5.zip")
         actions = agent.module(torch.from_numpy(observations))
     """
-    if trust not in (None, "pickle"):
-        raise SettingError(f"trust={trust!r}", '"pickle" or None', 'write trust="pickle"')
-    path = Path(path)
+    check_trust(trust)
+    path = _find(path)
     archive = read_archive(path)
-    statistics, statistics_sha256 = _statistics(path, vecnormalize, trust)
-    recipe = find_recipe(archive.record, str(path))
+    check_policy(archive.record, str(path))
     n, m = (
         read_size(archive.record, f"{kind}_space", str(path)) for kind in ("observation", "action")
     )
+    recipe = find_recipe(archive.record, str(path))
     given = given_bounds(action_low, action_high, m)
+    statistics, statistics_sha256 = read_statistics(path, vecnormalize, n, trust)
     read = _unpickled if trust else _rebuilt
     network, squashed, bounds = read(archive, recipe, (n, m), given)
     _check_bounds(bounds, squashed, str(path))
     parts: list[nn.Module] = [network, Rescale(bounds) if squashed else Clip(bounds)]
     if statistics is not None:
-        _check_statistics(statistics, n, vecnormalize)
         parts.insert(0, Normalise(statistics))
     return Agent(
         recipe.algorithm,
@@ -110,6 +106,17 @@ def read_agent(
         archive.library_version(),
         statistics_sha256,
     )
+
+
+def _find(path: str | Path) -> Path:
+    if not isinstance(path, (str, Path)):
+        raise SettingError(
+            f"an agent of type {type(path).__name__}",
+            "the path of a zip",
+            'save it first: agent.save("agent.zip"); distill(agent, env) takes the agent itself',
+        )
+    path = Path(path)
+    return path.with_suffix(".zip") if not path.suffix and not path.exists() else path
 
 
 def _rebuilt(
@@ -127,58 +134,8 @@ def _unpickled(
 ) -> tuple[nn.Module, bool, Bounds]:
     from fdtasil.sb3.trusted import unpickle_agent  # imports stable-baselines3
 
-    network, squashed, bounds = unpickle_agent(archive, recipe)
+    network, squashed, bounds = unpickle_agent(archive, recipe, sizes)
     return network, squashed, given or bounds
-
-
-def _statistics(
-    path: Path, vecnormalize: VecNormalizePath, trust: Trust
-) -> tuple[Statistics | None, str | None]:
-    if vecnormalize is False:
-        return None, None
-    if vecnormalize is None:
-        _check_neighbours(path)
-        return None, None
-    file = Path(vecnormalize)
-    data = read_file(file)
-    if trust != "pickle":
-        raise ExpertError(
-            f"{file} is a Python pickle, which runs any code when it is opened",
-            "a file that you trust",
-            'if you do, write trust="pickle" (--trust pickle on the command line)',
-        )
-    from fdtasil.sb3.trusted import unpickle_statistics
-
-    statistics = unpickle_statistics(file, data)
-    return statistics, sha256(data) if statistics is not None else None
-
-
-def _check_neighbours(path: Path) -> None:
-    """Refuse to leave out statistics that lie where stable-baselines3's tools put them."""
-    # rl-zoo writes <agent folder>/<environment>/vecnormalize.pkl; the hub and callbacks write
-    # vec_normalize.pkl and ..._vecnormalize_..._steps.pkl beside the zip.
-    patterns = [f"{folder}*vec*normalize*.pkl" for folder in ("", "*/")]
-    found = sorted(file for pattern in patterns for file in path.parent.glob(pattern))
-    if found:
-        raise ExpertError(
-            f"{found[0]} lies beside {path.name}, and vecnormalize was not given",
-            "the statistics that the agent was trained with, or none",
-            f'write vecnormalize="{found[0]}" with trust="pickle", or vecnormalize=False',
-        )
-
-
-def _check_statistics(
-    statistics: Statistics, observation_size: int, source: VecNormalizePath
-) -> None:
-    arrays = (statistics.mean, statistics.scale)
-    shapes = [array.shape for array in arrays]
-    finite = all(np.isfinite(array).all() for array in arrays)
-    if shapes != [(observation_size,)] * 2 or not finite or not (statistics.scale > 0).all():
-        raise ExpertError(
-            f"{source} has statistics of shape {shapes[0]}",
-            f"({observation_size},) finite numbers, as the agent's observations",
-            "check that the two files belong together",
-        )
 
 
 def _check_bounds(bounds: Bounds, squashed: bool, source: str) -> None:

@@ -14,7 +14,7 @@ from torch import Tensor
 from fdtasil.errors import ExpertError
 from fdtasil.storage import sha256
 
-__all__ = ["Archive", "first_line", "read_archive", "read_file"]
+__all__ = ["Archive", "first_line", "read_archive", "read_file", "shown"]
 
 _FILE_LIMIT = 256 * 2**20
 # A few kilobytes of zip can unpack to gigabytes, so the sizes are looked at before unpacking.
@@ -121,7 +121,16 @@ def read_file(path: Path) -> bytes:
 
 def first_line(error: Exception) -> str:
     """Return the start of an error's message, for a message of ours."""
-    return (str(error).strip().splitlines() or [type(error).__name__])[0][:200]
+    return shown((str(error).strip().splitlines() or [type(error).__name__])[0])
+
+
+def shown(text: object) -> str:
+    """Return text from a file as one short printable line, for a message of ours.
+
+    A file may hold line breaks, megabytes, and the control characters of a terminal.
+    """
+    line = "".join(character if character.isprintable() else "?" for character in str(text)[:201])
+    return line if len(line) <= 200 else f"{line[:197]}..."
 
 
 def _member(path: Path, content: bytes, name: str) -> bytes:

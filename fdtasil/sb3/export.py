@@ -8,10 +8,11 @@ import torch
 from numpy.typing import ArrayLike
 
 from fdtasil.environments import EnvironmentLike, EnvironmentPool
-from fdtasil.errors import ExpertError
+from fdtasil.errors import ExpertError, SettingError
 from fdtasil.onnx_files import export_module
 from fdtasil.rollouts import follow, rollout
-from fdtasil.sb3.agent import Agent, Trust, VecNormalizePath, read_agent
+from fdtasil.sb3.agent import Agent, read_agent
+from fdtasil.sb3.statistics import Trust, VecNormalizePath
 from fdtasil.storage import write_bytes
 
 __all__ = ["export_sb3"]
@@ -41,8 +42,8 @@ def export_sb3(
         out: The file to write.
         env: The agent's environment. It is checked that it fits, and the file is compared with
             the agent on states of a short rollout; without it, on random states.
-        vecnormalize: The VecNormalize file that the agent was trained with; it is a pickle, and
-            needs `trust`.
+        vecnormalize: The VecNormalize file that the agent was trained with, which is a pickle and
+            needs `trust`; False where there is none, although a file beside the zip looks like it.
         trust: "pickle" lets stable-baselines3 load what can't be read without running code that
             is in the files.
         action_low: (m,) or one number, instead of the bounds that the zip has as text.
@@ -53,6 +54,7 @@ def export_sb3(
 
     Raises:
         ExpertError: If the agent can't be read, or does not fit the environment.
+        SettingError: If an argument has a value that can't be used.
         ExportError: If it can't be exported, or the file and the agent differ by more than 1e-5.
         StorageError: If the file can't be written.
 
@@ -67,10 +69,22 @@ def export_sb3(
         action_low=action_low,
         action_high=action_high,
     )
+    _check_out(Path(out), agent.source)
     states, where = _random_states(agent) if env is None else _visited_states(agent, env)
     metadata = {**_metadata(agent), "compared_on": f"{len(states)} {where}"}
     write_bytes(Path(out), export_module(agent.module, states, metadata))
     return Path(out)
+
+
+def _check_out(out: Path, source: Path) -> None:
+    found = "is a folder" if out.is_dir() else ""
+    found = "is the agent's own zip" if out.resolve() == source.resolve() else found
+    if found:
+        raise SettingError(
+            f"out={str(out)!r} {found}",
+            "the name of a file that may be written",
+            f"write out={source.with_suffix('.onnx').name!r}",
+        )
 
 
 def _random_states(agent: Agent) -> tuple[np.ndarray, str]:

@@ -2,7 +2,6 @@
 
 import re
 from collections.abc import Mapping
-from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
@@ -10,25 +9,12 @@ import torch
 from torch import Tensor, nn
 
 from fdtasil.errors import ExpertError
+from fdtasil.sb3.archive import shown
 from fdtasil.sb3.recipes import TRUST, Recipe
 from fdtasil.sb3.spaces import Bounds
+from fdtasil.sb3.statistics import Statistics
 
-__all__ = ["Clip", "Normalise", "Rescale", "Statistics", "build_network"]
-
-
-@dataclass(frozen=True)
-class Statistics:
-    """What VecNormalize knows of observations.
-
-    Attributes:
-        mean: (n,) float64.
-        scale: (n,) float64, the standard deviation with epsilon in it.
-        clip: Largest absolute value of a normalised observation.
-    """
-
-    mean: np.ndarray
-    scale: np.ndarray
-    clip: float
+__all__ = ["Clip", "Normalise", "Rescale", "build_network"]
 
 
 class Normalise(nn.Module):
@@ -108,7 +94,7 @@ def build_network(
     strange = [name for name in strange if name not in recipe.unused]
     if strange:
         raise ExpertError(
-            f"{source} has weights that no MLP policy has: {', '.join(strange[:3])}",
+            f"{source} has weights that no MLP policy has: {shown(', '.join(strange[:3]))}",
             f"weights of {', '.join(known)}",
             TRUST,
         )
@@ -129,7 +115,7 @@ def _pairs(weights: Mapping[str, Tensor], prefix: str, source: str) -> list[tupl
     stems = stems or [f"{prefix}.{2 * index}" for index in range(len(names) // 2)]
     if names != {f"{stem}.{part}" for stem in stems for part in ("weight", "bias")}:
         raise ExpertError(
-            f"{source} has layers that are not linear: {', '.join(sorted(names))}",
+            f"{source} has layers that are not linear: {shown(', '.join(sorted(names)))}",
             "linear layers and activations in turn",
             TRUST,
         )

@@ -8,9 +8,18 @@ from typing import Any
 from torch import nn
 
 from fdtasil.errors import ExpertError
+from fdtasil.sb3.archive import shown
 
-__all__ = ["TRUST", "Recipe", "find_recipe", "read_activation"]
+__all__ = [
+    "TRUST",
+    "Recipe",
+    "check_policy",
+    "find_recipe",
+    "has_usual_policy",
+    "read_activation",
+]
 
+_ITSELF = "load it with its own library, and pass the agent itself: distill(agent, env)"
 TRUST = 'if you trust its source, write trust="pickle": that runs the code in the zip'
 
 Record = Mapping[str, Any]
@@ -79,7 +88,8 @@ RECIPES = (
     ),
     Recipe(
         "SAC",
-        {"target_entropy": None, "ent_coef": None},
+        # CrossQ has the first two as well, and batch normalisation in its actor.
+        {"target_entropy": None, "ent_coef": None, "target_update_interval": None},
         frozenset({"stable_baselines3.sac.policies.SACPolicy"}),
         **_GAUSSIAN,
     ),
@@ -109,38 +119,57 @@ _HARMLESS = {
     *("n_quantiles", "net_arch", "normalize_images", "optimizer_class", "optimizer_kwargs"),
     *("ortho_init", "sde_net_arch", "share_features_extractor", "use_expln"),
 }
-# The library's own policies that fdtasil has no place for, trusted or not.
+# Policies that are not read, trusted or not, and what to do instead.
+_TRAIN = "choose or train such an agent; fdtasil distils no other"
 _UNFIT = {
-    r"(stable_baselines3|sb3_contrib)\..*Cnn": "a policy on images",
-    r"(stable_baselines3|sb3_contrib)\..*MultiInput": "a policy on dictionaries of observations",
-    r"sb3_contrib\..*recurrent": "a policy with memory",
+    r"(stable_baselines3|sb3_contrib)\..*Cnn": ("a policy on images", _TRAIN),
+    r"(stable_baselines3|sb3_contrib)\..*MultiInput": (
+        "a policy on dictionaries of observations",
+        _TRAIN,
+    ),
+    r"sb3_contrib\..*recurrent": ("a policy with memory", _TRAIN),
+    r"sbx\.": ("a policy of sbx, whose weights are JAX's", _ITSELF),
+    r"stable_baselines\.": ("a policy of stable-baselines 2, of TensorFlow", _ITSELF),
 }
+
+
+def check_policy(record: Record, source: str) -> None:
+    """Refuse a policy that needs more than flat observations, or is another library's.
+
+    Raises:
+        ExpertError: If it is one.
+    """
+    policy = _policy_class(record)
+    for pattern, (reason, next_step) in _UNFIT.items():
+        if re.match(pattern, policy):
+            raise ExpertError(
+                f"{source} holds {reason} ({policy})",
+                "a policy of stable-baselines3 on flat observations, without memory",
+                next_step,
+            )
 
 
 def find_recipe(record: Record, source: str) -> Recipe:
     """Return the recipe of the algorithm that wrote the record.
 
     Raises:
-        ExpertError: If it is none of those known, or its policy needs more than flat observations.
+        ExpertError: If it is none of those known.
     """
-    policy = _policy_class(record)
-    for pattern, reason in _UNFIT.items():
-        if re.match(pattern, policy):
-            raise ExpertError(
-                f"{source} holds {reason} ({policy})",
-                "a policy on flat observations, without memory",
-                "choose or train such an agent; fdtasil distils no other",
-            )
     for recipe in RECIPES:
         if all(
             key in record and value in (None, record[key]) for key, value in recipe.marks.items()
         ):
             return recipe
     raise ExpertError(
-        f"{source} holds no agent of a known algorithm (its policy: {policy})",
+        f"{source} holds no agent of a known algorithm (its policy: {_policy_class(record)})",
         f"one of {', '.join(sorted(recipe.algorithm for recipe in RECIPES))}",
-        "load it yourself and pass a function: lambda observations: agent.predict(...)[0]",
+        _ITSELF,
     )
+
+
+def has_usual_policy(record: Record, recipe: Recipe) -> bool:
+    """Whether the policy is the algorithm's own class for flat observations."""
+    return _policy_class(record) in recipe.policies
 
 
 def read_activation(record: Record, recipe: Recipe, source: str) -> type[nn.Module]:
@@ -149,10 +178,9 @@ def read_activation(record: Record, recipe: Recipe, source: str) -> type[nn.Modu
     Raises:
         ExpertError: If it is another policy, with the reason.
     """
-    policy = _policy_class(record)
-    if policy not in recipe.policies:
+    if not has_usual_policy(record, recipe):
         expected = " or ".join(sorted(recipe.policies))
-        raise _cannot(source, f"has the policy class {policy}", expected)
+        raise _cannot(source, f"has the policy class {_policy_class(record)}", expected)
     settings = record.get("policy_kwargs") or {}
     if not isinstance(settings, dict):
         raise ExpertError(
@@ -162,10 +190,10 @@ def read_activation(record: Record, recipe: Recipe, source: str) -> type[nn.Modu
         raise _cannot(source, "uses gSDE", "a policy with plain Gaussian noise or none")
     if settings.get("squash_output"):
         raise _cannot(source, "squashes its output", "the usual output of its algorithm")
-    extractor = settings.get("features_extractor_class")
+    extractor = _text(settings, "features_extractor_class")
     if extractor is not None and extractor not in _FLATTEN:
         raise _cannot(source, f"has the feature extractor {extractor}", "FlattenExtractor")
-    activation = settings.get("activation_fn")
+    activation = _text(settings, "activation_fn")
     if activation is not None and activation not in _ACTIVATIONS:
         names = ", ".join(kind.__name__ for kind in _ACTIVATIONS.values())
         raise _cannot(source, f"has the activation {activation}", f"one of {names}")
@@ -181,16 +209,20 @@ def read_activation(record: Record, recipe: Recipe, source: str) -> type[nn.Modu
     return recipe.activation if activation is None else _ACTIVATIONS[activation]
 
 
+def _text(settings: Record, name: str) -> str | None:
+    return None if settings.get(name) is None else str(settings[name])
+
+
 def _policy_class(record: Record) -> str:
-    entry = record.get("policy_class")
+    entry = record.get("policy_class", record.get("policy"))  # in stable-baselines 2 the latter
     entry = entry if isinstance(entry, dict) else {}
     # A class is recorded by its dictionary, which has its module but not its name: only the
     # names of its functions tell.
     function = re.match(r"<function (\w+)\.__init__ at ", str(entry.get("__init__")))
-    return f"{entry.get('__module__')}.{function[1] if function else '?'}"
+    return shown(f"{entry.get('__module__')}.{function[1] if function else '?'}")
 
 
 def _cannot(source: str, found: str, expected: str) -> ExpertError:
     return ExpertError(
-        f"{source} {found}, which can't be read without unpickling", expected, TRUST
+        f"{source} {shown(found)}, which can't be read without unpickling", expected, TRUST
     )

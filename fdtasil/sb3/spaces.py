@@ -9,10 +9,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fdtasil.errors import ExpertError, SettingError
+from fdtasil.sb3.archive import shown
 
 __all__ = ["Bounds", "given_bounds", "read_bounds", "read_size"]
 
 _BOX = re.compile(r"<class '(?:gym|gymnasium)\.spaces\.box\.Box'>")
+_LARGEST = 10**6
 _ADVICE = {
     "observation_space": "train on flat observations (gymnasium.wrappers.FlattenObservation)",
     "action_space": "fdtasil distils continuous controllers only; choose another agent",
@@ -34,14 +36,21 @@ def read_size(record: Mapping[str, Any], name: str, source: str) -> int:
         ExpertError: If the space is another one.
     """
     entry = record.get(name)
-    entry = entry if isinstance(entry, dict) else {}
+    if not isinstance(entry, dict):
+        raise ExpertError(
+            f"{source} has no {name}",
+            "what save() of stable-baselines3 wrote",
+            "check that this is the right file",
+        )
     kind, dtype = str(entry.get(":type:")), str(entry.get("dtype"))
     shape = entry.get("_shape", entry.get("shape"))  # gym called it shape until 0.19
     if _BOX.fullmatch(kind) and (name != "action_space" or "float" in dtype):
-        if isinstance(shape, list) and len(shape) == 1 and isinstance(shape[0], int):
-            return shape[0]
+        sizes = shape if isinstance(shape, list) else []
+        # A size that no agent has may be there to fill the memory.
+        if len(sizes) == 1 and isinstance(sizes[0], int) and 0 < sizes[0] <= _LARGEST:
+            return sizes[0]
     raise ExpertError(
-        f"{source} has the {name} {kind} of shape {shape} and dtype {dtype}",
+        shown(f"{source} has the {name} {kind} of shape {shape} and dtype {dtype}"),
         "a Box of floats with one dimension",
         _ADVICE[name],
     )
@@ -102,4 +111,5 @@ def _numbers(text: str, size: int, source: str) -> np.ndarray:
             f"{size} numbers",
             "write action_low=env.action_space.low, action_high=env.action_space.high",
         )
-    return np.array(values, np.float32)
+    with np.errstate(over="ignore"):  # becomes infinite, which is judged where it matters
+        return np.array(values, np.float32)

@@ -10,15 +10,17 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import gymnasium
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from fdtasil.errors import ExpertError
 from fdtasil.sb3.archive import Archive, first_line
-from fdtasil.sb3.network import Statistics
-from fdtasil.sb3.recipes import Recipe
-from fdtasil.sb3.spaces import Bounds
+from fdtasil.sb3.network import Clip, Rescale
+from fdtasil.sb3.recipes import Recipe, has_usual_policy
+from fdtasil.sb3.spaces import Bounds, read_bounds
+from fdtasil.sb3.statistics import Statistics
 
 if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
@@ -46,14 +48,22 @@ class UnpickledPolicy(nn.Module):
             distribution.set_default_validate_args(before)
 
 
-def unpickle_agent(archive: Archive, recipe: Recipe) -> tuple[UnpickledPolicy, bool, Bounds]:
+def unpickle_agent(
+    archive: Archive, recipe: Recipe, sizes: tuple[int, int]
+) -> tuple[UnpickledPolicy, bool, Bounds]:
     """Load an agent with the class that wrote it.
+
+    Args:
+        archive: The zip.
+        recipe: Of its algorithm.
+        sizes: n and m, as the spaces say.
 
     Returns:
         The policy, whether its actions lie in -1..1 and are to be rescaled, and the bounds.
 
     Raises:
-        ExpertError: If the library is not there or can't load the zip.
+        ExpertError: If the library is not there or can't load the zip, or `predict` answers
+            otherwise than the policy that it would be replaced by.
     """
     try:
         algorithm = getattr(importlib.import_module(recipe.package), recipe.algorithm)
@@ -63,14 +73,16 @@ def unpickle_agent(archive: Archive, recipe: Recipe) -> tuple[UnpickledPolicy, b
             f"{recipe.algorithm} of {recipe.package}, which trust='pickle' loads with",
             f"pip install {recipe.package.replace('_', '-')}",
         ) from error
-    model = _load(algorithm, archive)
-    policy, space = model.policy, model.action_space
-    policy.set_training_mode(False)
+    model = _load(algorithm, archive, _replaced(algorithm, archive, recipe, sizes))
+    space, squashed = model.action_space, model.policy.squash_output
+    model.policy.set_training_mode(False)
     bounds = Bounds(
         np.asarray(getattr(space, "low"), np.float32),  # noqa: B009 (for the type checker)
         np.asarray(getattr(space, "high"), np.float32),  # noqa: B009
     )
-    return UnpickledPolicy(policy), policy.squash_output, bounds
+    policy = UnpickledPolicy(model.policy)
+    _check_predict(model, nn.Sequential(policy, Rescale(bounds) if squashed else Clip(bounds)))
+    return policy, squashed, bounds
 
 
 def unpickle_statistics(path: Path, data: bytes) -> Statistics | None:
@@ -83,7 +95,7 @@ def unpickle_statistics(path: Path, data: bytes) -> Statistics | None:
         ExpertError: If it can't be unpickled, or is something else.
     """
     try:
-        wrapper: Any = pickle.loads(data)
+        wrapper: Any = _Unpickler(io.BytesIO(data)).load()
         if not wrapper.norm_obs:
             return None
         mean, variance = (
@@ -99,15 +111,36 @@ def unpickle_statistics(path: Path, data: bytes) -> Statistics | None:
         ) from error
 
 
-def _load(algorithm: Any, archive: Archive) -> "BaseAlgorithm":
-    # Schedules are pickled functions, which other versions of Python can't call; acting does not
-    # need them.
-    unneeded = {"learning_rate": 0.0, "lr_schedule": _zero, "clip_range": _zero}
+class _Unpickler(pickle.Unpickler):
+    def find_class(self, module_name: str, global_name: str, /) -> Any:
+        # Until 2.0 the spaces were gym's; gymnasium reads the state of both.
+        package, dot, rest = module_name.partition(".")
+        package = "gymnasium" if package == "gym" else package
+        return super().find_class(package + dot + rest, global_name)
+
+
+def _replaced(
+    algorithm: Any, archive: Archive, recipe: Recipe, sizes: tuple[int, int]
+) -> dict[str, Any]:
+    """Return what is not unpickled, because other versions can't or acting does not need it."""
+    # Schedules are pickled functions, which other versions of Python can't call.
+    replaced: dict[str, Any] = dict.fromkeys(("lr_schedule", "clip_range", "clip_range_vf"), _zero)
+    replaced |= {"learning_rate": 0.0, "buffer_size": 1}  # a million transitions otherwise
+    if has_usual_policy(archive.record, recipe):
+        replaced["policy_class"] = algorithm.policy_aliases["MlpPolicy"]  # moved after 0.7
+    if str(archive.record["action_space"].get(":type:")).startswith("<class 'gym."):
+        box, bounds = gymnasium.spaces.Box, read_bounds(archive.record, sizes[1], "the zip")
+        replaced["observation_space"] = box(-np.inf, np.inf, sizes[:1], np.float32)
+        replaced["action_space"] = box(bounds.low, bounds.high, sizes[1:], np.float32)
+    return replaced
+
+
+def _load(algorithm: Any, archive: Archive, replaced: dict[str, Any]) -> "BaseAlgorithm":
     try:
         with _randomness_kept(), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             return algorithm.load(
-                io.BytesIO(archive.content), device="cpu", custom_objects=unneeded
+                io.BytesIO(archive.content), device="cpu", custom_objects=replaced
             )
     except Exception as error:  # unpickling may raise anything
         raise ExpertError(
@@ -115,6 +148,28 @@ def _load(algorithm: Any, archive: Archive) -> "BaseAlgorithm":
             "a zip that the installed version can load",
             "install what it names, or save it again with the version that wrote it",
         ) from error
+
+
+def _check_predict(model: "BaseAlgorithm", module: nn.Module) -> None:
+    """Refuse a policy class with a `predict` of its own, which the module would leave out."""
+    size = int(np.prod(model.observation_space.shape or ()))
+    states = np.random.default_rng(0).standard_normal((64, size), dtype=np.float32)
+    try:
+        expected = model.predict(states, deterministic=True)[0]
+        with torch.no_grad():
+            found = module(torch.from_numpy(states)).numpy()
+    except Exception as error:  # code of the zip's author
+        raise ExpertError(
+            f"the policy can't be asked: {first_line(error)}",
+            f"answers to observations of shape (64, {size})",
+            "load it yourself, and pass a function on batches of observations",
+        ) from error
+    if not np.allclose(found, expected, rtol=1e-5, atol=1e-5, equal_nan=True):
+        raise ExpertError(
+            "predict() of the agent's policy does more than its _predict()",
+            "the scaling or clipping of stable-baselines3, and nothing else",
+            "load it yourself, and pass the agent: distill(agent, env)",
+        )
 
 
 @contextmanager
