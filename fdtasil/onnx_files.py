@@ -20,7 +20,15 @@ if TYPE_CHECKING:
     import onnx
     import onnxruntime
 
-__all__ = ["export_module", "is_batched", "open_session", "read_model", "rebatched", "run_session"]
+__all__ = [
+    "export_module",
+    "is_batched",
+    "open_session",
+    "read_model",
+    "rebatched",
+    "run_session",
+    "side_files",
+]
 
 _OPSET = 18  # old enough for the runtimes on robots, new enough for torch's exporter
 _SIZE_LIMIT = 256 * 2**20
@@ -75,6 +83,16 @@ def read_model(path: Path) -> "tuple[onnx.ModelProto, str]":
             "copy both files together under their old names, or export with external_data=False",
         ) from error
     return model, sha256(data)
+
+
+def side_files(data: bytes) -> set[str]:
+    """Return the side files that a model's bytes name, unchecked; none where they are no model."""
+    import onnx
+
+    try:
+        return _side_files(onnx.load_model_from_string(data))
+    except Exception:  # `read_model` says what they are instead
+        return set()
 
 
 def open_session(model: "onnx.ModelProto", name: str) -> "onnxruntime.InferenceSession":

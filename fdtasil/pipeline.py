@@ -78,7 +78,8 @@ def distill(
     differences). The expert is never differentiated, unless `probes="jacobian"`.
 
     Args:
-        expert: An ONNX path, the path of a stable-baselines3 zip, a torch module, an object with
+        expert: An ONNX path, the path of a stable-baselines3 zip, either of them on the Hugging
+            Face hub (`hf://org/repo/file[@revision]`), a torch module, an object with
             stable-baselines3's `predict`, or a function on batches (B, n) -> (B, m) in
             environment units. None with `demonstrations`: then nobody is asked.
         env: A gymnasium id (`module:Id` too), a gymnasium environment, or a function making one.

@@ -9,6 +9,7 @@ from fdtasil.datasets import Dataset
 from fdtasil.environments import EnvironmentLike, EnvironmentPool
 from fdtasil.errors import SettingError
 from fdtasil.experts import Expert, ExpertLike, load_expert
+from fdtasil.experts.hub import is_hub_uri
 from fdtasil.presets import Preset
 from fdtasil.probes import EXACT, Probes
 from fdtasil.sb3 import Trust
@@ -79,7 +80,9 @@ def open_subject(
         opened = None
         if expert is not None:
             opened = load_expert(expert, n, m, output=output, trust=trust)
-        named = str(expert) if isinstance(expert, (str, Path)) else opened and opened.name
+        # The hub's files are called by their commit, which `expert` may leave open.
+        by_path = isinstance(expert, (str, Path)) and not is_hub_uri(expert)
+        named = str(expert) if by_path else opened and opened.name
         yield Subject(opened, named, pool, name, n, m)
 
 

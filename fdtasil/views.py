@@ -9,6 +9,7 @@ import numpy as np
 
 from fdtasil.demonstrations import Answers, Demonstrations
 from fdtasil.errors import SettingError
+from fdtasil.experts.hub import fetch, is_hub_uri
 from fdtasil.onnx_files import read_model
 from fdtasil.rollouts import Policy
 
@@ -109,9 +110,10 @@ class View:
 
 def columns_of(policy: object) -> tuple[int, ...] | None:
     """Return the columns that an exported student's file says it sees, or None."""
-    if not isinstance(policy, (str, Path)) or Path(policy).suffix != ".onnx":
+    path = fetch(policy).path if is_hub_uri(policy) else policy
+    if not isinstance(path, (str, Path)) or Path(path).suffix != ".onnx":
         return None
-    model, _ = read_model(Path(policy))
+    model, _ = read_model(Path(path))
     texts = {entry.key: entry.value for entry in model.metadata_props}
     columns = texts.get(COLUMNS)
     return None if columns is None else tuple(int(column) for column in columns.split(","))

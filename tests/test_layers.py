@@ -85,6 +85,7 @@ def test_only_sb3_imports_stable_baselines3():
 
 def test_the_face_is_light():
     heavy = ["stable_baselines3", "matplotlib", "onnx", "onnxruntime", "scipy.stats"]
+    heavy += ["huggingface_hub"]
     code = f"import sys, fdtasil; print([m for m in {heavy} if m in sys.modules])"
     shown = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True

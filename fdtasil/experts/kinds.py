@@ -13,8 +13,9 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 import torch
 
-from fdtasil.errors import ExpertError, FdtasilWarning
+from fdtasil.errors import ExpertError, FdtasilWarning, SettingError
 from fdtasil.experts.expert import CHUNK, Answer, Expert
+from fdtasil.experts.hub import fetch, is_hub_uri
 from fdtasil.experts.onnx_expert import open_onnx
 from fdtasil.experts.workers import BATCH, check_workers, with_processes, with_threads
 from fdtasil.sb3 import Trust, read_agent
@@ -32,7 +33,7 @@ class Predictor(Protocol):
 
 
 ExpertLike = str | Path | Expert | torch.nn.Module | Predictor | Callable[[np.ndarray], np.ndarray]
-"""A path, an expert, a torch module, an object with `predict`, or a function on batches."""
+"""A path, `hf://...`, an expert, a torch module, an object with `predict`, or a function."""
 
 
 def load_expert(
@@ -50,7 +51,8 @@ def load_expert(
     """Open whatever answers observations with actions.
 
     Args:
-        source: An ONNX path, the path of a stable-baselines3 zip, a torch module, an object with
+        source: An ONNX path, the path of a stable-baselines3 zip, either of them on the Hugging
+            Face hub (`hf://org/repo/file[@revision]`), a torch module, an object with
             stable-baselines3's `predict`, a function (B, n) -> (B, m), or an `Expert`, of which a
             copy is returned.
         observation_size: n, where it is known; checked against the expert.
@@ -71,7 +73,8 @@ def load_expert(
 
     Raises:
         ExpertError: If it can't be opened or sent to another process, or its sizes are others.
-        SettingError: If workers, threads and timeout don't go together.
+        SettingError: If code of the hub would be trusted, or workers, threads and timeout don't
+            go together.
 
     Example:
         >>> load_expert(lambda observations: -observations[:, :2], action_size=2).name
@@ -80,6 +83,8 @@ def load_expert(
     check_workers(workers, threads, timeout)
     if isinstance(source, Expert):
         expert = dataclasses.replace(source, queries=Counter())
+    elif is_hub_uri(source):
+        expert = _from_hub(str(source), observation_size, action_size, output, trust)
     elif isinstance(source, (str, Path)) and Path(source).suffix == ".zip":
         expert = _from_agent(Path(source), trust)
     elif isinstance(source, (str, Path)):
@@ -113,8 +118,9 @@ def _opener(
     """Return what opens a file again in another process; what is no file is sent as it is."""
     if not isinstance(source, (str, Path)):
         return None
+    place = expert.name if is_hub_uri(source) else Path(source).absolute()
     sizes = expert.observation_size, expert.action_size
-    return partial(_open_again, Path(source).absolute(), *sizes, output, trust, expert.sha256)
+    return partial(_open_again, place, *sizes, output, trust, expert.sha256)
 
 
 def _open_again(
@@ -151,6 +157,24 @@ def _sized(expert: Expert, observation_size: int | None, action_size: int | None
     return dataclasses.replace(
         expert, observation_size=said[0] or expected[0], action_size=said[1] or expected[1]
     )
+
+
+def _from_hub(
+    uri: str,
+    observation_size: int | None,
+    action_size: int | None,
+    output: str | None,
+    trust: Trust,
+) -> Expert:
+    if trust is not None:
+        raise SettingError(
+            f"trust={trust!r} with {uri}",
+            "no trust: what others put on the hub is never run",
+            "download the file, look at it, and name its path",
+        )
+    file = fetch(uri)
+    expert = load_expert(file.path, observation_size, action_size, output=output)
+    return dataclasses.replace(expert, name=file.uri)
 
 
 def _from_agent(path: Path, trust: Trust) -> Expert:
