@@ -3,6 +3,7 @@
 import hashlib
 import json
 import threading
+import time
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
@@ -31,11 +32,12 @@ class Repository:
 
 @dataclass
 class Request:
-    """What somebody asked for, where, and with which token."""
+    """What somebody asked for, where, with which token, and at what time."""
 
     server: str
     path: str
     token: str | None
+    at: float
 
 
 class StandIn:
@@ -91,7 +93,7 @@ class Handler(BaseHTTPRequestHandler):
     def do_GET(self):
         hub, path = self.stand_in, urlsplit(self.path).path
         token = self.headers.get("Authorization")
-        hub.requests.append(Request(self.name, unquote(path), token))
+        hub.requests.append(Request(self.name, unquote(path), token, time.monotonic()))
         if hub.silent is not None and hub.silent in path:
             hub.closing.wait(60)
             self.close_connection = True
