@@ -15,6 +15,7 @@ import torch
 
 from fdtasil.errors import ExpertError, FdtasilWarning, SettingError
 from fdtasil.experts.expert import CHUNK, Answer, Expert
+from fdtasil.experts.http_expert import is_http_url, open_http
 from fdtasil.experts.hub import fetch, is_hub_uri
 from fdtasil.experts.onnx_expert import open_onnx
 from fdtasil.experts.workers import BATCH, check_workers, with_processes, with_threads
@@ -33,7 +34,7 @@ class Predictor(Protocol):
 
 
 ExpertLike = str | Path | Expert | torch.nn.Module | Predictor | Callable[[np.ndarray], np.ndarray]
-"""A path, `hf://...`, an expert, a torch module, an object with `predict`, or a function."""
+"""A path, `hf:` or `http:` address, expert, torch module, object with `predict`, or function."""
 
 
 def load_expert(
@@ -53,20 +54,22 @@ def load_expert(
     Args:
         source: An ONNX path, the path of a stable-baselines3 zip, either of them on the Hugging
             Face hub (`hf://org/repo/file[@revision]`), a torch module, an object with
-            stable-baselines3's `predict`, a function (B, n) -> (B, m), or an `Expert`, of which a
-            copy is returned.
+            stable-baselines3's `predict`, a function (B, n) -> (B, m), `http://host:port/path`
+            (`POST {"observations": [[...]]}`, answered by `{"actions": [[...]]}`), or an `Expert`,
+            of which a copy is returned.
         observation_size: n, where it is known; checked against the expert.
         action_size: m, where it is known; chooses among the outputs of an ONNX file.
         output: Name of the ONNX output that holds the actions.
-        batch: Rows asked at once; 1 asks row by row. Left out, it is 1024, or 8 for each of
-            `workers`: equal batches give equal bytes, whatever the number of workers.
+        batch: Rows asked at once; 1 asks row by row. Left out, it is 1024, 64 over HTTP, 8
+            with `workers`: equal batches give equal bytes, whatever the number of workers.
         trust: "pickle" lets stable-baselines3 load what can't be read from a zip without running
             code that is in it.
         workers: Processes that answer side by side, for slow experts. They start at the first
             question, hold a copy of the expert each, and compute on one thread.
         threads: Use threads of this process instead, for experts that wait or let other threads
-            run.
-        timeout: Seconds that a batch may take; a process that hangs is ended. None is for ever.
+            run; those behind HTTP always do.
+        timeout: Seconds that a batch may take; a process that hangs is ended. None is for ever,
+            and 10 s over HTTP.
 
     Returns:
         The expert, with an empty ledger.
@@ -80,9 +83,12 @@ def load_expert(
         >>> load_expert(lambda observations: -observations[:, :2], action_size=2).name
         'the function <lambda>'
     """
-    check_workers(workers, threads, timeout)
+    remote = is_http_url(source)
+    check_workers(workers, threads, timeout, remote)
     if isinstance(source, Expert):
         expert = dataclasses.replace(source, queries=Counter())
+    elif is_http_url(source):
+        expert = open_http(source, action_size, timeout)
     elif is_hub_uri(source):
         expert = _from_hub(str(source), observation_size, action_size, output, trust)
     elif isinstance(source, (str, Path)) and Path(source).suffix == ".zip":
@@ -107,7 +113,7 @@ def load_expert(
     expert = expert if batch is None else _limited(expert, batch)
     if not workers:
         return expert
-    if threads:
+    if threads or remote:  # who waits for a server needs no process
         return with_threads(expert, workers)
     return with_processes(expert, _opener(source, expert, output, trust), workers, timeout)
 

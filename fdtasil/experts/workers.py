@@ -44,13 +44,14 @@ _ONE_THREAD = dict.fromkeys(
 )
 
 
-def check_workers(workers: int, threads: bool, timeout: float | None) -> None:
+def check_workers(workers: int, threads: bool, timeout: float | None, remote: bool) -> None:
     """Check how an expert is to be asked.
 
     Args:
         workers: How many processes or threads.
         threads: Whether they are threads.
         timeout: Seconds for a batch, or None.
+        remote: Whether the expert keeps the time itself, as those behind HTTP do.
 
     Raises:
         SettingError: If the arguments don't go together.
@@ -65,7 +66,7 @@ def check_workers(workers: int, threads: bool, timeout: float | None) -> None:
         return
     if isinstance(timeout, bool) or not 0 < timeout < float("inf"):
         raise SettingError(f"timeout={timeout!r}", "a number of seconds", "write timeout=60")
-    if threads or not workers:
+    if not remote and (threads or not workers):
         raise SettingError(
             f"timeout={timeout:g} without processes",
             "an expert in a process of its own: only that can be ended while it hangs",
