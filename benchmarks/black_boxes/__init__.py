@@ -52,7 +52,7 @@ _ALL = (
     BlackBox(
         "http",
         "A shipped expert behind HTTP on this machine: nothing but its answers is to be had.",
-        "Swimmer-v5",
+        "Walker2d-v5",
         make_http,
         serves=True,
     ),

@@ -15,7 +15,7 @@ def main() -> None:
     arguments = parser.parse_args()
     box = BLACK_BOXES[arguments.name]
     with box.open(arguments.out) as expert:
-        print(f"{box.name}: {expert}\n{box.about}")
+        print(f"{box.name}: {getattr(expert, 'name', expert)}\n{box.about}")
         episodes = measure(expert, box.environment, box.horizon, arguments.episodes)
         print(
             f"{box.environment}, {arguments.episodes} episodes of {box.horizon} steps: return "

@@ -15,7 +15,7 @@ from .visits import shipped_expert
 
 
 @contextmanager
-def make_http(folder: Path, environment: str = "Swimmer-v5") -> Iterator[str]:
+def make_http(folder: Path, environment: str = "Walker2d-v5") -> Iterator[str]:
     """Serve a shipped expert for as long as the context lasts, on a free port of the loopback.
 
     Args:
