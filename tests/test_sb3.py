@@ -1,5 +1,7 @@
 """Agents of stable-baselines3 answer as predict() does: as modules, as ONNX files, as experts."""
 
+import runpy
+import sys
 from functools import partial
 from pathlib import Path
 
@@ -214,3 +216,16 @@ def test_export_from_a_shell(save, monkeypatch, capsys, tmp_path):
     main()
     assert capsys.readouterr().out == f"written: {out}\n"
     assert fdtasil.load_expert(out).action_size == 1
+
+
+def test_the_parity_table(monkeypatch, capsys):
+    """A short version of what experts/parity.py shows of every algorithm."""
+    script = str(Path(__file__).parents[1] / "experts" / "parity.py")
+    short = ["--algorithms", "TD3", "PPO", "--environments", "Pendulum-v1", "--steps", "70"]
+    monkeypatch.setattr("sys.argv", [script, *short])
+    monkeypatch.setattr("sys.path", list(sys.path))
+    with seeded(), pytest.raises(SystemExit, match="^0$"):
+        runpy.run_path(script, run_name="__main__")
+    table = capsys.readouterr().out
+    assert table.count("| Pendulum-v1 |") == 8
+    assert "has written: 0" in table

@@ -6,7 +6,15 @@ from functools import partial
 import gymnasium
 import numpy as np
 import pytest
-from sb3_agents import answers, make_agent, predict, save_agent, save_old_statistics, states_for
+from sb3_agents import (
+    answers,
+    booby_trap,
+    make_agent,
+    predict,
+    save_agent,
+    save_old_statistics,
+    states_for,
+)
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import fdtasil
@@ -48,6 +56,12 @@ def test_statistics_are_folded_in(save, statistics, tmp_path):
     found = run_session(open_session(model, "test"), "actions", raw)
     assert np.abs(found - expected).max() <= 1e-5
     assert "vecnormalize_sha256" in {entry.key for entry in model.metadata_props}
+
+
+def test_trust_in_statistics_runs_no_code_of_the_zip(plain, statistics, tmp_path):
+    booby_trap(plain, tmp_path / "marker", "data")
+    read_agent(plain, vecnormalize=tmp_path / "statistics.pkl", trust="pickle")
+    assert not (tmp_path / "marker").exists()
 
 
 def test_unused_statistics(save, statistics, tmp_path):

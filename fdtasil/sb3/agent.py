@@ -10,7 +10,7 @@ from torch import nn
 from fdtasil.errors import ExpertError, SettingError
 from fdtasil.sb3.archive import Archive, read_archive
 from fdtasil.sb3.network import Clip, Normalise, Rescale, build_network
-from fdtasil.sb3.recipes import Recipe, check_policy, find_recipe, read_activation
+from fdtasil.sb3.recipes import TRUST, Recipe, check_policy, find_recipe, read_activation
 from fdtasil.sb3.spaces import Bounds, given_bounds, read_bounds, read_size
 from fdtasil.sb3.statistics import Trust, VecNormalizePath, check_trust, read_statistics
 
@@ -58,9 +58,9 @@ def read_agent(
     Args:
         path: The zip of a SAC, TD3, DDPG, TQC, PPO, A2C or TRPO agent with an MLP policy; its
             ".zip" may be left out, as in stable-baselines3.
-        trust: "pickle" to have stable-baselines3 load the zip. That runs any code that is in it,
-            and is needed for gSDE, custom policies, feature extractors and activations, and for
-            VecNormalize statistics.
+        trust: "pickle" to have stable-baselines3 load what can't be read otherwise: gSDE, custom
+            policies, feature extractors and activations, and the statistics of VecNormalize. That
+            runs any code that is in such a file.
         vecnormalize: The file with the statistics of VecNormalize that the agent was trained
             with, which becomes part of the module; False where there are none, although a file
             beside the zip looks like them.
@@ -89,8 +89,7 @@ def read_agent(
     recipe = find_recipe(archive.record, str(path))
     given = given_bounds(action_low, action_high, m)
     statistics, statistics_sha256 = read_statistics(path, vecnormalize, n, trust)
-    read = _unpickled if trust else _rebuilt
-    network, squashed, bounds = read(archive, recipe, (n, m), given)
+    network, squashed, bounds = _read_network(archive, recipe, (n, m), given, trust)
     _check_bounds(bounds, squashed, str(path))
     parts: list[nn.Module] = [network, Rescale(bounds) if squashed else Clip(bounds)]
     if statistics is not None:
@@ -119,6 +118,24 @@ def _find(path: str | Path) -> Path:
     return path.with_suffix(".zip") if not path.suffix and not path.exists() else path
 
 
+def _read_network(
+    archive: Archive, recipe: Recipe, sizes: tuple[int, int], given: Bounds | None, trust: Trust
+) -> tuple[nn.Module, bool, Bounds]:
+    """Return the network, whether its actions are to be rescaled, and the bounds.
+
+    Trust in statistics, which always need it, is no reason to run code of a zip that needs none.
+    """
+    try:
+        return _rebuilt(archive, recipe, sizes, given)
+    except ExpertError as refusal:
+        if trust is None or refusal.next_step != TRUST:
+            raise
+    from fdtasil.sb3.trusted import unpickle_agent  # imports stable-baselines3
+
+    network, squashed, bounds = unpickle_agent(archive, recipe, sizes)
+    return network, squashed, given or bounds
+
+
 def _rebuilt(
     archive: Archive, recipe: Recipe, sizes: tuple[int, int], given: Bounds | None
 ) -> tuple[nn.Module, bool, Bounds]:
@@ -127,15 +144,6 @@ def _rebuilt(
     bounds = given or read_bounds(archive.record, sizes[1], source)
     network = build_network(archive.weights(), recipe, activation, sizes, source)
     return network, recipe.squashed, bounds
-
-
-def _unpickled(
-    archive: Archive, recipe: Recipe, sizes: tuple[int, int], given: Bounds | None
-) -> tuple[nn.Module, bool, Bounds]:
-    from fdtasil.sb3.trusted import unpickle_agent  # imports stable-baselines3
-
-    network, squashed, bounds = unpickle_agent(archive, recipe, sizes)
-    return network, squashed, given or bounds
 
 
 def _check_bounds(bounds: Bounds, squashed: bool, source: str) -> None:
