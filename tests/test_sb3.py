@@ -224,7 +224,7 @@ def test_the_parity_table(monkeypatch, capsys):
     short = ["--algorithms", "TD3", "PPO", "--environments", "Pendulum-v1", "--steps", "70"]
     monkeypatch.setattr("sys.argv", [script, *short])
     monkeypatch.setattr("sys.path", list(sys.path))
-    with seeded(), pytest.raises(SystemExit, match="^0$"):
+    with seeded(), pytest.raises(SystemExit, match=r"^0$"):
         runpy.run_path(script, run_name="__main__")
     table = capsys.readouterr().out
     assert table.count("| Pendulum-v1 |") == 8
