@@ -200,7 +200,8 @@ def ask_probes(
     assert probes.stencil is not None, "the order sets the stencil"
     reach = 1.0 if probes.space == "raw" else probes.directions.reach(len(live))
     step = 1.0 if probes.stencil.exact else probes.radius * reach
-    bank, numbers = probes.directions.draw(len(observations), len(live), random)
+    states = observations[:, live] / (step * step_scale[live])
+    bank, numbers = probes.directions.draw(len(observations), states, random)
     displacements = np.zeros((len(bank), len(step_scale)), np.float32)
     displacements[:, live] = step * bank * step_scale[live]
     gain = len(live) ** 0.5 / step

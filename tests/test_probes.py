@@ -8,12 +8,39 @@ from fdtasil.probes import (
     CENTRAL,
     DIRECTIONS,
     STENCILS,
+    AdaptiveDirections,
     OrthogonalFrames,
     Probes,
     RandomSphere,
+    is_redundant,
 )
 
 COUNTS = {"basis": None, "jacobian": None}
+
+
+def states(dimension, physical=None):
+    """Demonstrated states; functions of `physical` coordinates only, if given."""
+    random = np.random.default_rng(5)
+    if physical is None:
+        return random.standard_normal((200, dimension))
+    return random.standard_normal((200, physical)) @ random.standard_normal((physical, dimension))
+
+
+def test_half_the_adaptive_directions_are_excursions_where_observations_are_redundant():
+    redundant = states(20, physical=3)
+    bank, _ = AdaptiveDirections(10).draw(300, redundant, np.random.default_rng(0))
+    basis = np.linalg.svd(redundant, full_matrices=False)[2][:3]
+    possible = np.linalg.norm(bank @ basis.T, axis=1) > 0.999 * np.linalg.norm(bank, axis=1)
+    assert 0.45 < possible.mean() < 0.55
+    assert np.allclose(np.linalg.norm(bank[~possible], axis=1), 1)
+    free, _ = AdaptiveDirections(10).draw(300, states(20), np.random.default_rng(0))
+    assert np.allclose(np.linalg.norm(free, axis=1), 1)
+
+
+def test_few_states_say_nothing_of_redundant_directions():
+    """As many coordinates as states: what looks like few directions is few states."""
+    assert not is_redundant(states(20, physical=3)[:20])
+    assert is_redundant(states(20, physical=3))
 
 
 @pytest.mark.parametrize("dimension", [1, 3, 17])
@@ -21,13 +48,13 @@ COUNTS = {"basis": None, "jacobian": None}
 @pytest.mark.parametrize("design", DIRECTIONS)
 def test_every_design_keeps_the_contract(design, rows, dimension):
     directions = DIRECTIONS[design](COUNTS.get(design, 7))
-    bank, numbers = directions.draw(rows, dimension, np.random.default_rng(0))
+    bank, numbers = directions.draw(rows, states(dimension), np.random.default_rng(0))
     assert bank.shape[1] == dimension
     assert numbers.shape == (rows, directions.count(dimension))
     assert np.allclose(np.linalg.norm(bank, axis=1), 1)
     assert numbers.min() >= 0
     assert numbers.max() < len(bank)
-    again = directions.draw(rows, dimension, np.random.default_rng(0))
+    again = directions.draw(rows, states(dimension), np.random.default_rng(0))
     assert np.array_equal(bank, again[0])
     assert np.array_equal(numbers, again[1])
 
@@ -37,20 +64,20 @@ def test_the_mean_square_of_a_derivative_is_the_jacobians(design):
     """E over directions of d |J u|^2 is |J|_F^2: what makes one weight fit every design."""
     jacobian = np.random.default_rng(1).standard_normal((3, 6))
     directions = DIRECTIONS[design](COUNTS.get(design, 12))
-    bank, numbers = directions.draw(600, 6, np.random.default_rng(0))
+    bank, numbers = directions.draw(600, states(6), np.random.default_rng(0))
     squares = 6 * ((bank[numbers] @ jacobian.T) ** 2).sum(axis=-1)
     assert squares.mean() == pytest.approx((jacobian**2).sum(), rel=0.05)
 
 
 def test_a_state_is_never_probed_along_the_same_direction_twice():
-    _, sphere = RandomSphere(50).draw(3000, 4, np.random.default_rng(0))
-    _, frames = OrthogonalFrames(50).draw(3000, 4, np.random.default_rng(0))
+    _, sphere = RandomSphere(50).draw(3000, states(4), np.random.default_rng(0))
+    _, frames = OrthogonalFrames(50).draw(3000, states(4), np.random.default_rng(0))
     for numbers in (sphere, frames[:, :4]):
         assert all(len(set(row)) == len(row) for row in numbers.tolist())
 
 
 def test_a_whole_frame_is_orthonormal():
-    bank, numbers = OrthogonalFrames().draw(9, 5, np.random.default_rng(0))
+    bank, numbers = OrthogonalFrames().draw(9, states(5), np.random.default_rng(0))
     for frame in bank[numbers]:
         assert np.allclose(frame @ frame.T, np.eye(5), atol=1e-12)
 
@@ -70,6 +97,7 @@ def test_every_stencil_is_exact_on_a_line_and_of_its_order_on_a_parabola(stencil
     "spec",
     [
         "sphere:10",
+        "adaptive:7,central",
         "orthogonal:4,central",
         "basis",
         "jacobian",
@@ -87,7 +115,7 @@ def test_a_spec_reads_back(spec):
 def test_short_specs():
     assert Probes.parse(0) is None
     assert Probes.parse("none") is None
-    assert Probes.parse(10) == Probes.parse("10") == Probes.parse("sphere:10")
+    assert Probes.parse(10) == Probes.parse("10") == Probes.parse("adaptive:10")
 
 
 @pytest.mark.parametrize(
@@ -104,4 +132,4 @@ def test_a_wrong_spec_is_refused_with_an_example(spec):
 def test_predicted_queries():
     assert Probes.parse("basis,central").queries(10, 7, visits=99) == 140
     assert Probes.parse("jacobian").queries(10, 7, visits=99) == 0
-    assert Probes.parse("sphere:4,resample").queries(10, 7, visits=9) == 3 * 40
+    assert Probes.parse("sphere:4,forward,resample").queries(10, 7, visits=9) == 3 * 40

@@ -4,14 +4,14 @@ Every design lowers to the same small thing: a bank of displacements and, for ea
 numbers of the rows of the bank that it is probed along. Nothing else knows which design it was.
 """
 
+from fdtasil.probes.adaptive import AdaptiveDirections, is_redundant
 from fdtasil.probes.directions import (
-    DIRECTIONS,
     Directions,
     OrthogonalFrames,
     RandomSphere,
     StandardBasis,
 )
-from fdtasil.probes.source import Probes
+from fdtasil.probes.source import DIRECTIONS, Probes
 from fdtasil.probes.stencils import CENTRAL, EXACT, FORWARD, STENCILS, Stencil
 
 __all__ = [
@@ -20,10 +20,12 @@ __all__ = [
     "EXACT",
     "FORWARD",
     "STENCILS",
+    "AdaptiveDirections",
     "Directions",
     "OrthogonalFrames",
     "Probes",
     "RandomSphere",
     "StandardBasis",
     "Stencil",
+    "is_redundant",
 ]

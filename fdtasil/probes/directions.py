@@ -1,6 +1,5 @@
 """Where to probe: every design lowers to a bank of directions and row numbers per state."""
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Protocol
 
@@ -8,7 +7,7 @@ import numpy as np
 
 from fdtasil.errors import SettingError
 
-__all__ = ["DIRECTIONS", "Directions", "OrthogonalFrames", "RandomSphere", "StandardBasis"]
+__all__ = ["Directions", "OrthogonalFrames", "RandomSphere", "StandardBasis", "check_directions"]
 
 # Rows of a bank: with more states than this, states share directions, which costs no accuracy
 # (the states differ) and keeps Humanoid's 100,000 states from storing gigabytes of directions.
@@ -16,7 +15,7 @@ _BANK = 4096
 
 
 class Directions(Protocol):
-    """Where to probe: unit vectors of the live coordinates."""
+    """Where to probe, in the coordinates that are live."""
 
     def count(self, dimension: int) -> int:
         """Return how many directions each state is probed along."""
@@ -27,9 +26,18 @@ class Directions(Protocol):
         ...
 
     def draw(
-        self, rows: int, dimension: int, random: np.random.Generator
+        self, rows: int, states: np.ndarray, random: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray]:
-        """Return a bank (P, dimension) of unit rows and their numbers (rows, count) per state."""
+        """Return a bank of directions, and which of them each state is probed along.
+
+        Args:
+            rows: Number of states to probe.
+            states: (S, d) demonstrated states, in units of a step; most designs only look at d.
+            random: Draws the directions.
+
+        Returns:
+            The bank (P, d), in units of a step, and (rows, count) row numbers in it.
+        """
         ...
 
 
@@ -46,9 +54,10 @@ class StandardBasis:
         return 1.0
 
     def draw(
-        self, rows: int, dimension: int, random: np.random.Generator
+        self, rows: int, states: np.ndarray, random: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray]:
         """See `Directions.draw`; nothing is random."""
+        dimension = states.shape[1]
         numbers = np.broadcast_to(np.arange(dimension, dtype=np.int32), (rows, dimension))
         return np.eye(dimension), numbers
 
@@ -60,7 +69,7 @@ class RandomSphere:
     probes: int
 
     def __post_init__(self) -> None:
-        _check_count(self.probes)
+        check_directions(self.probes)
 
     def count(self, dimension: int) -> int:
         """As many as asked for."""
@@ -71,9 +80,10 @@ class RandomSphere:
         return dimension**0.5
 
     def draw(
-        self, rows: int, dimension: int, random: np.random.Generator
+        self, rows: int, states: np.ndarray, random: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray]:
         """See `Directions.draw`."""
+        dimension = states.shape[1]
         size = min(rows * self.probes, max(_BANK, self.probes))
         normal = random.standard_normal((size, dimension))
         bank = normal / np.linalg.norm(normal, axis=1, keepdims=True)
@@ -99,7 +109,7 @@ class OrthogonalFrames:
 
     def __post_init__(self) -> None:
         if self.probes is not None:
-            _check_count(self.probes)
+            check_directions(self.probes)
 
     def count(self, dimension: int) -> int:
         """As many as asked for, or one for each coordinate."""
@@ -110,9 +120,10 @@ class OrthogonalFrames:
         return dimension**0.5
 
     def draw(
-        self, rows: int, dimension: int, random: np.random.Generator
+        self, rows: int, states: np.ndarray, random: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray]:
         """See `Directions.draw`."""
+        dimension = states.shape[1]
         count = self.count(dimension)
         frames_each = -(-count // dimension)
         frames = min(rows * frames_each, max(_BANK // dimension, frames_each))
@@ -128,15 +139,8 @@ class OrthogonalFrames:
         return bank, (frame * dimension + turn % dimension).astype(np.int32)
 
 
-DIRECTIONS: dict[str, Callable[[int | None], Directions]] = {
-    "basis": lambda count: StandardBasis(),
-    "sphere": lambda count: RandomSphere(10 if count is None else count),
-    "orthogonal": lambda count: OrthogonalFrames(10 if count is None else count),
-    "jacobian": lambda count: OrthogonalFrames(),
-}
-
-
-def _check_count(probes: int) -> None:
+def check_directions(probes: int) -> None:
+    """Raise a SettingError where `probes` is no number of directions."""
     if isinstance(probes, bool) or not isinstance(probes, int) or probes < 1:
         raise SettingError(f"probes={probes!r}", "a positive integer", "write probes=10")
 

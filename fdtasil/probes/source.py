@@ -8,10 +8,25 @@ from typing import Literal
 import numpy as np
 
 from fdtasil.errors import SettingError
-from fdtasil.probes.directions import DIRECTIONS, Directions, OrthogonalFrames, RandomSphere
+from fdtasil.probes.adaptive import AdaptiveDirections
+from fdtasil.probes.directions import (
+    Directions,
+    OrthogonalFrames,
+    RandomSphere,
+    StandardBasis,
+)
 from fdtasil.probes.stencils import CENTRAL, EXACT, FORWARD, STENCILS, Stencil
 
-__all__ = ["Probes"]
+__all__ = ["DIRECTIONS", "Probes"]
+
+DIRECTIONS: dict[str, Callable[[int | None], Directions]] = {
+    "adaptive": lambda count: AdaptiveDirections(10 if count is None else count),
+    "basis": lambda count: StandardBasis(),
+    "sphere": lambda count: RandomSphere(10 if count is None else count),
+    "orthogonal": lambda count: OrthogonalFrames(10 if count is None else count),
+    "jacobian": lambda count: OrthogonalFrames(),
+}
+"""Every design by the name it is written with; the count may be left open."""
 
 
 @dataclass(frozen=True)
@@ -20,11 +35,11 @@ class Probes:
 
     Attributes:
         directions: Where.
-        stencil: How: `FORWARD`, `CENTRAL`, or `EXACT` (a differentiable expert only). None is
-            forward for first order and central for second.
+        stencil: How: `FORWARD`, `CENTRAL`, or `EXACT` (a differentiable expert only). None
+            leaves it to the calibration, or is forward for first order and central for second.
         radius: How far. Whitened space: standard deviations moved by each coordinate that moves
             (root mean square). Raw space: Euclidean length of the displacement.
-            None leaves it to the preset.
+            None leaves it to the calibration, or to the preset.
         space: "whitened" scales each coordinate by its standard deviation over the
             demonstrations and freezes those that do not move; "raw" takes observations as they
             are. None leaves it to the preset.
@@ -36,7 +51,7 @@ class Probes:
     Example:
         >>> Probes.parse("sphere:5,resample") == Probes(RandomSphere(5), resample=True)
         True
-        >>> Probes.parse(10).queries(states=300, dimension=17, visits=100)
+        >>> Probes.parse("sphere:10,forward").queries(states=300, dimension=17, visits=100)
         3000
     """
 
@@ -73,8 +88,8 @@ class Probes:
         """Read a derivative source as it is written in a call or a shell.
 
         Args:
-            spec: 0 or "none" (plain behaviour cloning), N (N directions on the random sphere),
-                or a text `design[:count][,option...]`: designs basis, sphere, orthogonal,
+            spec: 0 or "none" (plain behaviour cloning), N (N adaptive directions), or a text
+                `design[:count][,option...]`: designs adaptive, basis, sphere, orthogonal,
                 jacobian; options forward, central, resample, whitened, raw, radius=R,
                 per_step=K. A `Probes` is returned as it is.
 
@@ -92,7 +107,7 @@ class Probes:
             return None if spec == "none" else _parse_text(spec)
         if isinstance(spec, bool) or not isinstance(spec, (int, np.integer)) or spec < 0:
             raise SettingError(f"probes={spec!r}", _GRAMMAR, _EXAMPLES)
-        return Probes(RandomSphere(int(spec))) if spec else None
+        return Probes(AdaptiveDirections(int(spec))) if spec else None
 
     def describe(self) -> str:
         """Return the text that `parse` reads back, with the radius where it is set."""
@@ -113,14 +128,23 @@ class Probes:
         parts += [f"per_step={self.per_step}"] if self.per_step is not None else []
         return ",".join(parts)
 
-    def with_order(self, order: int) -> "Probes":
+    @property
+    def exact(self) -> bool:
+        """Whether the expert is differentiated, and not asked."""
+        return self.stencil is EXACT
+
+    def with_order(self, order: int, usual: Stencil | None = FORWARD) -> "Probes":
         """Return the source with a stencil that has differences up to `order`.
+
+        Args:
+            order: 1 or 2.
+            usual: The stencil of first order where none is set; None leaves it open.
 
         Raises:
             SettingError: If the stencil that was asked for has none of second order.
         """
-        stencil = self.stencil or (CENTRAL if order == 2 else FORWARD)
-        if order == 2 and not stencil.exact and stencil.second is None:
+        stencil = self.stencil or (CENTRAL if order == 2 else usual)
+        if order == 2 and stencil and not stencil.exact and stencil.second is None:
             raise SettingError(
                 f"order=2 with the {stencil.name} stencil",
                 "a stencil with second differences",
@@ -129,7 +153,7 @@ class Probes:
         return replace(self, stencil=stencil)
 
     def queries(self, states: int, dimension: int, visits: int) -> int:
-        """Return the rows that the expert is asked for.
+        """Return the rows that the expert is asked for, at most where the stencil is open.
 
         Args:
             states: Number of labelled states.
@@ -138,7 +162,7 @@ class Probes:
         """
         count = self.directions.count(dimension)
         pools = self.pools(dimension, visits)
-        return pools * states * count * len((self.stencil or FORWARD).offsets)
+        return pools * states * count * len((self.stencil or CENTRAL).offsets)
 
     def pools(self, dimension: int, visits: int) -> int:
         """Return how often the expert is asked for a new set of answers; see `queries`."""

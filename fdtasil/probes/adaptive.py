@@ -1,0 +1,79 @@
+"""Directions that look at the states: isotropic, or half of them where the states lie apart."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fdtasil.probes.directions import RandomSphere, check_directions
+
+__all__ = ["AdaptiveDirections", "is_redundant"]
+
+_VARIANCE = 0.99
+_STATES = 2048  # looked at for excursions: enough for a bank, and 2048 x 2048 distances are quick
+_APART = 10  # rows: a state's neighbours in time are not where a student would drift to
+_STRETCH = 2.0
+_MIXED = 3
+
+
+@dataclass(frozen=True)
+class AdaptiveDirections:
+    """`probes` directions for each state, isotropic unless the observations are redundant.
+
+    Where observations are functions of few physical coordinates (Humanoid: 60 of 257 principal
+    components hold 99 % of the variance; Ant, Walker2d and HalfCheetah: more than 3 of 4), almost
+    no isotropic displacement can ever occur, and the student learns answers to impossible states.
+    Half of the directions are then excursions: random combinations of the differences between
+    states and the nearest ones of other times, twice as long. Humanoid, 5 episodes: normalised
+    return 0.81 with isotropic directions, 0.92 with the mixture.
+    """
+
+    probes: int
+
+    def __post_init__(self) -> None:
+        check_directions(self.probes)
+
+    def count(self, dimension: int) -> int:
+        """As many as asked for."""
+        return self.probes
+
+    def reach(self, dimension: int) -> float:
+        """All coordinates move."""
+        return dimension**0.5
+
+    def draw(
+        self, rows: int, states: np.ndarray, random: np.random.Generator
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """See `Directions.draw`."""
+        bank, numbers = RandomSphere(self.probes).draw(rows, states, random)
+        if is_redundant(states):
+            excursions = _excursions(states, len(bank), random)
+            chosen = random.random(len(bank)) < 0.5
+            bank = np.where(chosen[:, None], excursions, bank)
+        return bank, numbers
+
+
+def is_redundant(states: np.ndarray) -> bool:
+    """Return whether few of many directions hold 99 % of the variance of (S, d) states.
+
+    Fewer states than coordinates say nothing of directions.
+    """
+    count, dimension = states.shape
+    if count <= dimension:
+        return False
+    variances = np.linalg.eigvalsh(np.atleast_2d(np.cov(states.T)))
+    held = np.cumsum(variances[::-1]) / variances.sum()
+    return int((held < _VARIANCE).sum()) + 1 < dimension / 2
+
+
+def _excursions(states: np.ndarray, count: int, random: np.random.Generator) -> np.ndarray:
+    """Return (count, d) random combinations of differences between neighbouring states."""
+    some = np.linspace(0, len(states) - 1, min(len(states), _STATES)).astype(int)
+    points = states[some].astype(np.float64)
+    squares = (points**2).sum(axis=1)
+    distances = squares[:, None] + squares - 2 * points @ points.T
+    near_in_time = np.abs(some[:, None] - some) < _APART
+    nearest = np.where(near_in_time, np.inf, distances).argmin(axis=1)
+    differences = points - points[nearest]
+    picked = random.integers(len(points), size=(count, _MIXED))
+    factors = random.standard_normal((count, _MIXED)) * (_STRETCH / _MIXED**0.5)
+    return np.einsum("ck,ckd->cd", factors, differences[picked])
