@@ -5,11 +5,12 @@ import sys
 from pathlib import Path
 
 import benchmarks
+from benchmarks.non_differentiable import NON_DIFFERENTIABLE
 from benchmarks.quality import QUALITY
 from benchmarks.runner import FIGURES, RESULTS, Benchmark, read_rows, results_of, run
 from fdtasil.storage import write_bytes
 
-BENCHMARKS: dict[str, Benchmark] = {b.name: b for b in (QUALITY,)}
+BENCHMARKS: dict[str, Benchmark] = {b.name: b for b in (QUALITY, NON_DIFFERENTIABLE)}
 
 
 def main() -> int:

@@ -20,7 +20,9 @@ from fdtasil.errors import FdtasilError, SettingError
 from fdtasil.evaluation import interval_text, random_behaviour, score_text
 from fdtasil.experts import load_expert
 from fdtasil.experts.gate import examine_expert
+from fdtasil.figures import draw_calibration
 from fdtasil.pipeline import distill, evaluate
+from fdtasil.presets import PRESETS
 from fdtasil.rollouts import follow, rollout
 from fdtasil.sb3 import export_sb3
 from fdtasil.seeding import episode_seeds, generator
@@ -49,6 +51,7 @@ def inspect_expert(
     episodes: int = 5,
     horizon: int | None = None,
     seed: int = 0,
+    picture: Path | None = None,
 ) -> None:
     """Show what an expert is: its contract with the environment, and the return it reaches.
 
@@ -59,6 +62,7 @@ def inspect_expert(
         episodes: Episodes that the return is measured over.
         horizon: Steps after which an episode is cut; default: the environment's time limit.
         seed: Of the episodes.
+        picture: PNG file to draw the ladder of radii into.
     """
     check_count("episodes", episodes)
     with EnvironmentPool(env) as pool:
@@ -71,7 +75,9 @@ def inspect_expert(
         visited = recorded.observations[recorded.valid]
         spread = np.linspace(0, len(visited) - 1, 32).astype(int)
         findings = examine_expert(opened, visited[spread], boxes)
-        found = calibrate(opened, visited, statistics(visited), generator(seed, "calibration"))
+        usual = PRESETS["standard"].radius
+        random = generator(seed, "calibration")
+        found = calibrate(opened, visited, statistics(visited), random, usual)
     returns, falls = recorded.returns, int(recorded.terminated.sum())
     rows = [
         ("expert", expert),
@@ -89,6 +95,9 @@ def inspect_expert(
         ("ended early", f"{falls} of {episodes}, of at most {length} steps"),
     ]
     print("\n".join(f"{name:20}{value}" for name, value in rows))
+    if picture is not None:
+        write_bytes(picture, draw_calibration(found))
+        print(f"{'picture':20}{picture}")
     problem = next((finding.problem for finding in findings if finding.problem), None)
     if problem:
         raise problem

@@ -4,6 +4,7 @@ from dataclasses import asdict, dataclass
 from numbers import Integral
 from typing import Any
 
+from fdtasil.calibration import Ladder, ladder_for
 from fdtasil.errors import SettingError
 from fdtasil.fit import Fit
 from fdtasil.probes import Probes
@@ -27,6 +28,8 @@ class Configuration:
         demonstrations: sha256 of given demonstrations, or None.
         states: Number of given states, or None.
         probes: The derivative source, or None for plain behaviour cloning.
+        calibrated: Whether the expert is asked at many radii, for what the source leaves open.
+        usual_radius: Where such a calibration begins.
         probes_given: Whether the answers to the probes are given with the demonstrations.
         order: 0, 1 or 2, the order of the Taylor loss.
         observation_size: n, of the expert.
@@ -49,6 +52,8 @@ class Configuration:
     demonstrations: str | None
     states: int | None
     probes: Probes | None
+    calibrated: bool
+    usual_radius: float
     probes_given: bool
     order: int
     observation_size: int
@@ -68,7 +73,8 @@ class Configuration:
 
         Exact where no episode ends early and every coordinate moves; an upper bound elsewhere.
         """
-        found = {"check": 0, "act": 0, "label": 0, "probe": 0, "evaluate": 0}
+        purposes = ("check", "act", "label", "calibrate", "probe", "evaluate")
+        found = dict.fromkeys(purposes, 0)
         if self.evaluation_episodes:
             found["check"] = 2 * GATE_STATES * _ROWS_A_STATE
             found["evaluate"] = 2 * self.evaluation_episodes * self.horizon
@@ -76,7 +82,13 @@ class Configuration:
             found |= self.trainer.queries(self.episodes, self.horizon)
         if self.probes is not None and not self.probes_given:
             found["probe"] = self._predicted_probes(self.probes)
+            found["calibrate"] = self.ladder.queries if self.calibrated else 0
         return found
+
+    @property
+    def ladder(self) -> Ladder:
+        """The radii that a calibration asks at."""
+        return ladder_for(self._predicted_probes(self.probes) if self.probes else 0)
 
     def check_budget(self) -> None:
         """Refuse a run that may ask more than it is allowed to.

@@ -10,11 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from fdtasil.calibration import Calibration
 from fdtasil.datasets import Dataset
 from fdtasil.demonstrations import Answers, Demonstrations
 from fdtasil.errors import SettingError, StorageError
 from fdtasil.evaluation import Evaluation
-from fdtasil.figures import draw_returns, draw_training
+from fdtasil.figures import draw_calibration, draw_returns, draw_training
 from fdtasil.onnx_files import export_module
 from fdtasil.storage import to_json, verify, write_bytes, write_folder
 from fdtasil.student import Student
@@ -98,8 +99,8 @@ class Distilled:
         """Write the run folder.
 
         Files: config.json, report.json, progress.csv, demonstrations.npz, student.safetensors,
-        student.onnx, figures/training.png, figures/returns.png (of an evaluation), and last a
-        manifest.
+        student.onnx, figures/training.png, figures/returns.png (of an evaluation),
+        figures/calibration.png (of an expert that was probed), and last a manifest.
 
         Raises:
             StorageError: If a file can't be written; finished files stay whole.
@@ -111,6 +112,7 @@ class Distilled:
             "student.safetensors": self.student.to_bytes(self._metadata()),
             "student.onnx": self.onnx_bytes(),
             "figures/training.png": draw_training(self.history),
+            **self._calibration_picture(),
             "report.json": to_json(self.report),
         }
         if self.evaluation is not None:
@@ -154,6 +156,12 @@ class Distilled:
                 "a run folder written by this version of fdtasil",
                 "check the path, or run distill again",
             ) from error
+
+    def _calibration_picture(self) -> dict[str, bytes]:
+        found = self.report["calibration"]
+        if found is None:
+            return {}
+        return {"figures/calibration.png": draw_calibration(Calibration.from_json(found))}
 
     def _metadata(self) -> Mapping[str, str]:
         low, high = self.student.low.tolist(), self.student.high.tolist()

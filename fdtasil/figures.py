@@ -9,7 +9,9 @@ from fdtasil.evaluation import Evaluation, interval_text, score_text
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["draw_returns", "draw_training"]
+    from fdtasil.calibration import Calibration
+
+__all__ = ["draw_calibration", "draw_returns", "draw_training"]
 
 _STUDENT, _EXPERT = "#1f77b4", "#444444"
 
@@ -61,6 +63,29 @@ def draw_returns(evaluation: Evaluation) -> bytes:
     panel.set_ylim(bottom=min(0.0, *expert, *student))
     panel.grid(alpha=0.3, axis="y", linewidth=0.5)
     panel.legend(frameon=False, fontsize=8, loc="lower left", ncols=2)
+    return _png(figure)
+
+
+def draw_calibration(found: "Calibration") -> bytes:
+    """Draw how the expert's answers change with the distance of a probe, as a PNG."""
+    figure = _figure(7.0, 3.0)
+    change, agreement = figure.subplots(1, 2)
+    change.plot(found.radii, found.change, color=_STUDENT, marker="o", markersize=3)
+    change.axhline(found.noise_floor, color=_EXPERT, linestyle=":", label="noise floor")
+    change.set_yscale("log")
+    change.set_title("change of the action", fontsize=9)
+    change.set_ylabel("root mean square")
+    agreement.plot(found.radii[1:], found.similarity[1:], color=_STUDENT, marker="o", markersize=3)
+    agreement.set_ylim(-0.05, 1.05)
+    agreement.set_title("agreement of differences at a radius and a quarter of it", fontsize=9)
+    agreement.set_ylabel("secant similarity")
+    for panel in (change, agreement):
+        name = f"radius {found.radius:.2g}, {found.stencil} ({found.regime})"
+        panel.axvline(found.radius, color="#999999", linestyle="--", label=name)
+        panel.set_xscale("log")
+        panel.set_xlabel("radius, standard deviations of each coordinate")
+        panel.grid(alpha=0.3, linewidth=0.5)
+    change.legend(frameon=False, fontsize=7)
     return _png(figure)
 
 

@@ -84,10 +84,12 @@ def distill(
             environment units. None with `demonstrations`: then nobody is asked.
         env: A gymnasium id (`module:Id` too), a gymnasium environment, or a function making one.
             None with `demonstrations`: then nothing is recorded or evaluated.
-        probes: The derivative source: 0 (plain behaviour cloning), N or "sphere:N" (N random
+        probes: The derivative source: 0 (plain behaviour cloning), N (N random directions for
+            each state, of states that can occur where those are few), "sphere:N" (N isotropic
             directions for each state, asked once), "sphere:N,resample" (asked anew while
             training), "orthogonal:N", "basis", "jacobian" (the analytic reference). Options
-            after commas: forward, central, radius=R, raw, whitened, per_step=K.
+            after commas: forward, central, radius=R, raw, whitened, per_step=K. Radius and
+            stencil that are left open are found by asking at a ladder of radii first.
         trainer: Who acts in which round: "bc" (the expert), "dagger" (a mixture of expert and
             student), "dart" (the expert with noise), or a trainer with settings of its own.
         episodes: Number of demonstrations.
@@ -178,6 +180,11 @@ def distill(
             demonstrations=sha256(given.to_bytes()) if given else None,
             states=len(given.demonstrations) if given else None,
             probes=source,
+            calibrated=source is not None
+            and defaults.calibrates(source)
+            and not (given and given.answers)
+            and subject.expert is not None,
+            usual_radius=defaults.radius,
             probes_given=given is not None and given.answers is not None,
             order=order if source else 0,
             observation_size=subject.observation_size,

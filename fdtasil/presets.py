@@ -15,7 +15,9 @@ class Preset:
     """The defaults that a call leaves open.
 
     Attributes:
-        radius: Of the probes; see `Probes`.
+        radius: Of the probes; see `Probes`. Where calibrated, what teaches best if the expert
+            allows it.
+        calibrated: Whether the expert is asked at many radii before radius and stencil are set.
         space: Of the probes.
         per_step: Of the probes.
         hidden: Widths of the student's hidden layers.
@@ -24,6 +26,7 @@ class Preset:
     """
 
     radius: float
+    calibrated: bool
     space: Literal["whitened", "raw"]
     per_step: int | Literal["all"]
     hidden: tuple[int, ...]
@@ -31,15 +34,20 @@ class Preset:
     fit: Fit
 
     def complete(self, probes: Probes | None) -> Probes | None:
-        """Fill in what a derivative source leaves open."""
+        """Fill in what a derivative source leaves open, but for what a calibration finds."""
         if probes is None:
             return None
+        probes = replace(probes, space=probes.space or self.space)
+        radius = None if self.calibrates(probes) else self.radius
         return replace(
             probes,
-            radius=self.radius if probes.radius is None else probes.radius,
-            space=self.space if probes.space is None else probes.space,
+            radius=radius if probes.radius is None else probes.radius,
             per_step=self.per_step if probes.per_step is None else probes.per_step,
         )
+
+    def calibrates(self, probes: Probes) -> bool:
+        """Return whether what the source leaves open is found by asking the expert."""
+        return self.calibrated and not probes.exact and probes.space == "whitened"
 
     def fit_with(self, **given: float | None) -> Fit:
         """Return the optimisation with the fields of `Fit` that are given (not None) put in."""
@@ -53,6 +61,7 @@ class Preset:
 PRESETS = {
     "standard": Preset(
         radius=0.3,
+        calibrated=True,
         space="whitened",
         per_step=1,
         hidden=(512, 512),
@@ -75,6 +84,7 @@ PRESETS = {
     # the whole Jacobian's error there; `gain` makes it mean that for any number of probes here.
     "paper": Preset(
         radius=0.01,
+        calibrated=False,
         space="raw",
         per_step="all",
         hidden=(512, 512),

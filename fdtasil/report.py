@@ -5,6 +5,7 @@ import warnings
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from importlib.metadata import version
 from typing import Any
 
@@ -43,7 +44,8 @@ def report_of(
         notes: Warnings on the way.
     """
     plain = configuration.to_json()
-    probes, predicted = configuration.probes, configuration.predicted_queries()
+    source, calibration = rounds.source, rounds.calibration
+    predicted = replace(configuration, probes=source).predicted_queries()
     asked = rounds.expert.queries if rounds.expert else Counter[str]()
     return {
         "expert": {
@@ -51,8 +53,10 @@ def report_of(
             "sha256": configuration.expert_sha256,
             "return_mean": evaluation.expert_return if evaluation else None,
         },
-        **{name: plain[name] for name in ("env", "trainer", "probes", "seed")},
-        "radius": probes.radius if probes else None,
+        **{name: plain[name] for name in ("env", "trainer", "seed")},
+        "probes": source.describe() if source else "none",
+        "radius": source.radius if source else None,
+        "calibration": calibration.to_json() if calibration else None,
         "versions": versions(),
         "evaluation": evaluation.to_json() if evaluation else None,
         "queries": {name: asked[name] for name in predicted},

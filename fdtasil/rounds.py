@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import torch
 
+from fdtasil.calibration import Calibration, calibrate
 from fdtasil.configuration import Configuration
 from fdtasil.datasets import Dataset
 from fdtasil.demonstrations import (
@@ -25,6 +26,7 @@ from fdtasil.events import Callback, Event
 from fdtasil.experts import Expert
 from fdtasil.fit import Hooks, fit
 from fdtasil.fitstate import FitState
+from fdtasil.probes import Probes
 from fdtasil.progress import Stages
 from fdtasil.rollouts import Behaviour, Episodes, rollout
 from fdtasil.runfolder import RunFolder
@@ -59,6 +61,8 @@ class Rounds:
         steps: Gradient steps of all rounds.
         episodes: Number of episodes recorded so far.
         counts: Clipped actions, physics resets and falls of the recorded episodes.
+        calibration: What was found about the expert in the first round, or None.
+        source: The derivative source, with what the calibration found filled in.
         again: Rows asked before a checkpoint was taken up, which the interrupted run has asked
             and counted too; None in a run that was not interrupted.
     """
@@ -78,6 +82,11 @@ class Rounds:
     episodes: int = 0
     counts: Counter[str] = field(default_factory=Counter)
     again: int | None = None
+    calibration: Calibration | None = None
+    source: Probes | None = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.source = self.run.probes
 
     def all(self) -> None:
         """Do every round, beginning where the folder's checkpoints end."""
@@ -143,14 +152,32 @@ class Rounds:
             self.dataset = replace(before, demonstrations=before.demonstrations + new)
             old = before.answers
         if self.run.probes is not None:
+            self._calibrate()
             answers = self.ask(new.observations, round_, 0)
             answers = old + answers if old is not None else answers
-            self.dataset = replace(self.dataset, probes=self.run.probes, answers=answers)
+            self.dataset = replace(self.dataset, probes=self.source, answers=answers)
 
     def _probe_given(self) -> None:
         """Ask the probes around given states."""
+        self._calibrate()
         answers = self.ask(self.data.demonstrations.observations, 0, 0)
-        self.dataset = replace(self.data, probes=self.run.probes, answers=answers)
+        self.dataset = replace(self.data, probes=self.source, answers=answers)
+
+    def _calibrate(self) -> None:
+        """Find what the source leaves open, once, on the states of the first round."""
+        run, expert = self.run, self.expert
+        if not run.calibrated or self.calibration is not None or expert is None:
+            return
+        assert run.probes is not None
+        found = calibrate(
+            expert,
+            self.data.demonstrations.observations,
+            self.scales,
+            generator(run.seed, "calibration"),
+            run.usual_radius,
+            run.ladder,
+        )
+        self.calibration, self.source = found, found.complete(run.probes)
 
     def _record(
         self, pool: EnvironmentPool, behaviour: Behaviour, stream: str, first: int, count: int
@@ -163,7 +190,7 @@ class Rounds:
 
     def ask(self, observations: np.ndarray, *path: int) -> Answers:
         """Ask the probes around states, along the directions of a named stream."""
-        probes, expert = self.run.probes, self.expert
+        probes, expert = self.source, self.expert
         assert probes is not None
         if expert is None:
             raise SettingError(
@@ -209,8 +236,8 @@ class Rounds:
             entries = fit(
                 student.to(self.device),
                 seen,
-                run.probes,
-                pools if run.probes else None,
+                self.source,
+                pools if self.source else None,
                 run.fit,
                 lambda name: torch_generator(run.seed, "batches", round_, name),
                 order=run.order,
@@ -268,7 +295,12 @@ class Rounds:
         self.expert.queries["again"] += self.again
 
     def _keep_collected(self, round_: int) -> None:
-        about = {"episodes": self.episodes, "counts": self.counts, "queries": self._ledger()}
+        about = {
+            "episodes": self.episodes,
+            "counts": self.counts,
+            "queries": self._ledger(),
+            "calibration": self.calibration.to_json() if self.calibration else None,
+        }
         self.folder.save(
             round_,
             "collected",
@@ -284,6 +316,9 @@ class Rounds:
         self.dataset = Dataset.from_bytes(files["demonstrations.npz"])
         self.episodes, self.counts = state["episodes"], Counter(state["counts"])
         self._restore_ledger(state["queries"])
+        if state["calibration"] is not None and self.run.probes is not None:
+            self.calibration = Calibration.from_json(state["calibration"])
+            self.source = self.calibration.complete(self.run.probes)
         return True
 
     def _keep_trained(self, round_: int) -> None:
@@ -317,7 +352,7 @@ class _Pools:
     def __call__(self, number: int) -> Answers:
         rounds, data = self._rounds, self._rounds.data
         observations = data.demonstrations.observations
-        probes = rounds.run.probes
+        probes = rounds.source
         assert probes is not None
         assert probes.stencil is not None
         if number == 0:

@@ -11,7 +11,7 @@ from fdtasil.errors import SettingError
 from fdtasil.experts import Expert, ExpertLike, load_expert
 from fdtasil.experts.hub import is_hub_uri
 from fdtasil.presets import Preset
-from fdtasil.probes import EXACT, Probes
+from fdtasil.probes import EXACT, FORWARD, Probes
 from fdtasil.sb3 import Trust
 from fdtasil.trainers import Trainer, trainer_of
 
@@ -116,11 +116,13 @@ def source_of(
     if asked is None:
         return None
     if given is None or stored is None or given.answers is None:
-        return asked.with_order(order)
-    if spec != usual and asked.with_order(order) != stored:
+        return asked.with_order(order, None if preset.calibrates(asked) else FORWARD)
+    asked = replace(  # what was left open was found by a calibration, and is stored
+        asked, radius=asked.radius or stored.radius, stencil=asked.stencil or stored.stencil
+    ).with_order(order)
+    if spec != usual and asked != stored:
         raise SettingError(
-            f"probes={asked.with_order(order).describe()!r} with stored answers to "
-            f"{stored.describe()!r}",
+            f"probes={asked.describe()!r} with stored answers to {stored.describe()!r}",
             "the source that is stored, or probes=0",
             "leave probes= out, or record demonstrations of its own",
         )

@@ -21,11 +21,11 @@ EXPERTS = {
 def test_regimes_are_told_apart(regime, tmp_path):
     clean = load_expert(mlp_onnx(tmp_path / "e.onnx", sizes=(5, 16, 16, 2))).answer
     expert = load_expert(EXPERTS[regime](clean))
-    found = calibrate(expert, STATES, statistics(STATES), np.random.default_rng(0))
+    found = calibrate(expert, STATES, statistics(STATES), np.random.default_rng(0), 0.3)
     assert found.regime == regime
     assert found.stencil == ("forward" if regime == "smooth" else "central")
-    assert 0.05 < found.radius < 1
-    assert found.queries == expert.queries["check"] == 48 * 21
+    assert found.radius == (0.5 if regime == "steps" else 0.3)
+    assert found.queries == expert.queries["calibrate"] == 48 * 21
     if regime == "noisy":
         assert found.noise_floor == pytest.approx(1e-3, rel=0.3)
     if regime == "smooth":

@@ -12,8 +12,8 @@ from fdtasil.errors import ExpertError
 
 __all__ = ["Answer", "Expert", "Purpose", "RaisedElsewhere"]
 
-Purpose = Literal["check", "act", "label", "probe", "evaluate"]
-"""Why a row was asked: gate, acting in rollouts, labels, probes, evaluation."""
+Purpose = Literal["check", "act", "label", "calibrate", "probe", "evaluate"]
+"""Why a row was asked: gate, acting in rollouts, labels, radius, probes, evaluation."""
 
 Answer = Callable[[np.ndarray], np.ndarray]
 """(B, n) float32 raw observations -> (B, m) actions in environment units."""
