@@ -48,6 +48,7 @@ _COHERENT = 0.75
 # controller, which are smooth at most states, 0.5, trees and int8 less.
 _ROUGH = 0.62
 _ROUGH_RADIUS = 0.5
+_NOISY_FROM = 4.0**-6  # smallest radius with a derivative; float32 rounding stays below it
 _NOISY_SHARE = 0.3  # of noise in a difference; above it a given radius is warned of
 
 
@@ -189,7 +190,7 @@ def _judge(
     # The kinks of a ReLU network end the band before the distance that teaches best, so only
     # its lower end, where the noise is, moves the radius.
     low = float(radii[coherent[0]])
-    regime = "noisy" if low > 4.0**-6 else "smooth"
+    regime = "noisy" if coherent[0] > 0 and low > _NOISY_FROM else "smooth"
     radius = max(usual, low)
     here = float(np.interp(np.log(radius), np.log(radii), similarity))
     return regime, radius, "central" if regime == "noisy" or here < _ROUGH else "forward"

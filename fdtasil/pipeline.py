@@ -164,6 +164,8 @@ def distill(
         patience=patience,
     )
     source = source_of(probes, defaults, order, given, usual=DEFAULT_PROBES)
+    if source is not None and callable(student_obs):
+        source = source.with_order(order)  # a curved view allows the forward stencil only
     place = pick_device(device)
     widths = (hidden,) if isinstance(hidden, int) else hidden
     check_seed(seed)

@@ -5,7 +5,7 @@ from typing import Any, Literal
 
 from fdtasil.errors import SettingError
 from fdtasil.fit import Fit
-from fdtasil.probes import Probes
+from fdtasil.probes import AdaptiveDirections, Probes, RandomSphere
 
 __all__ = ["PRESETS", "Preset", "preset_of"]
 
@@ -17,7 +17,8 @@ class Preset:
     Attributes:
         radius: Of the probes; see `Probes`. Where calibrated, what teaches best if the expert
             allows it.
-        calibrated: Whether the expert is asked at many radii before radius and stencil are set.
+        calibrated: Whether the expert is asked at many radii before radius and stencil are set,
+            and the directions may look at the states.
         space: Of the probes.
         per_step: Of the probes.
         hidden: Widths of the student's hidden layers.
@@ -38,6 +39,8 @@ class Preset:
         if probes is None:
             return None
         probes = replace(probes, space=probes.space or self.space)
+        if isinstance(probes.directions, AdaptiveDirections) and not self.calibrated:
+            probes = replace(probes, directions=RandomSphere(probes.directions.probes))
         radius = None if self.calibrates(probes) else self.radius
         return replace(
             probes,

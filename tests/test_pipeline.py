@@ -72,6 +72,7 @@ def test_a_run_folder_holds_everything_and_reads_back(quick, tmp_path):
         "config.json",
         "report.json",
         "progress.csv",
+        "figures/calibration.png",
         "demonstrations.npz",
         "student.safetensors",
         "student.onnx",
@@ -125,7 +126,7 @@ def test_the_budget_is_checked_before_anything_is_asked():
     def expensive(observations):
         raise AssertionError("asked")
 
-    with pytest.raises(SettingError, match=r"may ask the expert .* probe 400"):
+    with pytest.raises(SettingError, match=r"may ask the expert .* probe 800"):
         fdtasil.distill(expensive, TOY, 10, max_queries=500, **QUICK)
 
 
