@@ -74,7 +74,7 @@ class Configuration:
         Exact where no episode ends early and every coordinate moves; an upper bound elsewhere.
         """
         purposes = ("check", "act", "label", "calibrate", "probe", "evaluate")
-        found = dict.fromkeys(purposes, 0)
+        found: dict[str, int] = dict.fromkeys(purposes, 0)
         if self.evaluation_episodes:
             found["check"] = 2 * GATE_STATES * _ROWS_A_STATE
             found["evaluate"] = 2 * self.evaluation_episodes * self.horizon

@@ -1,0 +1,208 @@
+"""What a training step, a question and an environment step cost, as ratios to what they must."""
+
+import statistics
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any
+
+import gymnasium
+import numpy as np
+import onnxruntime
+import torch
+
+from benchmarks.controllers import CONTROLLERS, available
+from benchmarks.runner import Benchmark, Cell, Row
+from fdtasil.compute import torch_settings
+from fdtasil.demonstrations import Demonstrations, ask_probes
+from fdtasil.demonstrations import statistics as scales_of
+from fdtasil.environments import EnvironmentPool
+from fdtasil.experts import load_expert
+from fdtasil.fit import fit
+from fdtasil.presets import PRESETS
+from fdtasil.probes import Probes
+from fdtasil.rollouts import follow, rollout
+from fdtasil.seeding import torch_generator
+from fdtasil.student import Student, StudentShape
+
+__all__ = ["SPEED"]
+
+SIZES = ((17, 6), (376, 17))
+SOURCES = (None, "sphere:10", "sphere:50", "sphere:10,resample")
+HIDDEN = 512
+BATCH = 100
+STATES = 1500
+STEPS = 150
+ROUNDS = 7
+BATCHES = (64, 256, 1024, 4096)
+
+
+def cells(quick: bool) -> list[Cell]:
+    """One cell for each size of a step, each expert that is asked, each environment stepped."""
+    found: list[Cell] = [{"what": "step", "size": list(size)} for size in SIZES]
+    experts = [name for name in available() if not name.startswith("paper/")]
+    if quick:
+        experts = experts[:1]
+    found += [{"what": "asking", "expert": name} for name in experts]
+    return found + [{"what": "stepping", "expert": name} for name in experts]
+
+
+def measure(cell: Cell) -> dict[str, Any]:
+    """Measure one cell, on one thread."""
+    with torch_settings(torch.device("cpu")):
+        return _MEASURES[cell["what"]](cell)
+
+
+def _step(cell: Cell) -> dict[str, Any]:
+    """Milliseconds of a step without and with probes, taken in turn, and of the floor."""
+    n, m = cell["size"]
+    tasks = {source: _task(n, m, source) for source in SOURCES}
+    times: dict[str, list[float]] = {str(source): [] for source in SOURCES}
+    times["floor"] = []
+    for _ in range(ROUNDS):
+        for source, task in tasks.items():
+            times[str(source)].append(_seconds(task) / STEPS * 1e3)
+        times["floor"].append(_floor(n, m) * 1e3)
+    return {"milliseconds": times}
+
+
+def _task(n: int, m: int, spec: str | None) -> Callable[[], object]:
+    random = np.random.default_rng(0)
+    observations = random.standard_normal((STATES, n)).astype(np.float32)
+    gain = random.standard_normal((n, m)).astype(np.float32) / n**0.5
+    expert = load_expert(lambda rows: np.tanh(rows @ gain))
+    number, actions = np.arange(STATES, dtype=np.int32) // 300, expert.ask(observations, "label")
+    demonstrations = Demonstrations(
+        observations, actions, number, number, actions, np.zeros(STATES), number > 9
+    )
+    preset = replace(PRESETS["standard"], calibrated=False)
+    probes = preset.complete(Probes.parse(spec))
+    probes = probes.with_order(1) if probes else None
+    scales, settings = scales_of(observations), replace(preset.fit, steps=STEPS)
+    ones = np.ones(m, np.float32)
+
+    def run() -> None:
+        shape = StudentShape(n, m, (HIDDEN, HIDDEN), "gelu")
+        start = torch_generator(0, "student")
+        student = Student(shape, scales.mean, scales.scale, -ones, ones, start)
+        fit(student, demonstrations, probes, ask if probes else None, settings, stream)
+
+    def asked(pool: int) -> Any:
+        assert probes is not None
+        return ask_probes(expert, observations, probes, scales, np.random.default_rng(pool))
+
+    # Stored answers are asked once for a whole training, of which this is a short piece.
+    stored = asked(0) if probes else None
+
+    def ask(pool: int) -> Any:
+        return asked(pool) if pool else stored
+
+    def stream(name: str) -> torch.Generator:
+        return torch_generator(0, name)
+
+    return run
+
+
+def _floor(n: int, m: int) -> float:
+    """Seconds that the products and the optimiser's traffic of a plain step take at best."""
+    weights = n * HIDDEN + HIDDEN * HIDDEN + HIDDEN * m
+    # Forward, gradients of the weights, gradients of the inputs of all layers but the first.
+    products = 2 * BATCH * (3 * weights - n * HIDDEN)
+    # AdamW reads weights, gradients and two moments, and writes all but the gradients.
+    traffic = 7 * 4 * weights
+    left, right = torch.randn(1024, 1024), torch.randn(1024, 1024)
+    rate = 2 * 1024**3 / min(_seconds(lambda: left @ right) for _ in range(5))
+    source, target = torch.randn(weights), torch.empty(weights)
+    memory = 8 * weights / min(_seconds(lambda: target.copy_(source)) for _ in range(20))
+    return products / rate + traffic / memory
+
+
+def _asking(cell: Cell) -> dict[str, Any]:
+    """Rows a second through `Expert.ask`, and of the bare session at its best batch."""
+    path = _path(cell)
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    session = onnxruntime.InferenceSession(path, options, providers=["CPUExecutionProvider"])
+    name, expert = session.get_inputs()[0].name, load_expert(path)
+    assert expert.observation_size is not None
+    rows = np.random.default_rng(0).standard_normal((16384, expert.observation_size))
+    rows = rows.astype(np.float32)
+    ours, bare = [], []
+
+    def whole(batch: int) -> None:
+        for start in range(0, len(rows), batch):
+            session.run(None, {name: rows[start : start + batch]})
+
+    for _ in range(ROUNDS):
+        ours.append(len(rows) / _seconds(lambda: expert.ask(rows, "probe")))
+        bare.append(len(rows) / min(_seconds(lambda b=b: whole(b)) for b in BATCHES))
+    return {"rows_per_second": {"ours": ours, "bare": bare}}
+
+
+def _stepping(cell: Cell) -> dict[str, Any]:
+    """Seconds of a rollout of 25 episodes of 100 steps, and of the bare environment's steps."""
+    ours, bare = [], []
+    with EnvironmentPool(cell["expert"]) as pool:
+        expert = load_expert(_path(cell))
+        seeds = list(range(25))
+        actions = rollout(follow(expert.policy("act")), pool, seeds, 100).actions
+        environment = gymnasium.make(cell["expert"])
+        for _ in range(ROUNDS):
+            bare.append(_seconds(lambda: _bare(environment, actions)))
+            ours.append(_seconds(lambda: rollout(follow(expert.policy("act")), pool, seeds, 100)))
+        environment.close()
+    return {"seconds": {"ours": ours, "bare": bare}}
+
+
+def _bare(environment: gymnasium.Env, actions: np.ndarray) -> None:
+    for episode, sequence in enumerate(actions):
+        environment.reset(seed=episode)
+        for action in sequence:
+            if environment.step(action)[2]:
+                break
+
+
+def _path(cell: Cell) -> str:
+    return str(CONTROLLERS[cell["expert"]].path)
+
+
+def _seconds(function: Callable[[], object]) -> float:
+    started = time.perf_counter()
+    function()
+    return time.perf_counter() - started
+
+
+_MEASURES = {"step": _step, "asking": _asking, "stepping": _stepping}
+
+
+def draw(rows: Sequence[Row]) -> dict[str, bytes]:
+    """One table of ratios, each pair by pair: minimum and median."""
+    lines = ["| what | of | ratio, minimum | median |", "|---|---|---|---|"]
+    for row in rows:
+        cell, result = row["cell"], row["result"]
+        if cell["what"] == "step":
+            times, name = result["milliseconds"], "{}/{}".format(*cell["size"])
+            for source in (str(source) for source in SOURCES[1:]):
+                lines.append(
+                    _line(f"step, {source}, {name}", "plain", times[source], times["None"])
+                )
+            lines.append(_line(f"plain step, {name}", "floor", times["None"], times["floor"]))
+        elif cell["what"] == "asking":
+            rates = result["rows_per_second"]
+            lines.append(_line(f"rows, {cell['expert']}", "session", rates["ours"], rates["bare"]))
+        else:
+            times = result["seconds"]
+            lines.append(
+                _line(f"rollout, {cell['expert']}", "env.step", times["ours"], times["bare"])
+            )
+    machines = sorted({row["machine"] for row in rows})
+    text = "\n".join([*lines, "", f"One thread. {', '.join(machines)}."])
+    return {"speed.md": (text + "\n").encode()}
+
+
+def _line(what: str, of: str, ours: Sequence[float], theirs: Sequence[float]) -> str:
+    ratios = [a / b for a, b in zip(ours, theirs, strict=True)]
+    return f"| {what} | {of} | {min(ratios):.2f} | {statistics.median(ratios):.2f} |"
+
+
+SPEED = Benchmark("speed", __doc__ or "", cells, measure, draw, alone=True)
