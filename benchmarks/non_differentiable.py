@@ -49,11 +49,11 @@ def run(cell: Cell) -> dict[str, Any]:
     evaluation, report = result.evaluation, result.report
     assert evaluation is not None
     scores = ("normalized_return", "expert_return", "student_return", "survival", "action_error")
-    names = ("train_seconds", "queries", "radius", "weight", "warnings")
+    names = ("train_seconds", "queries", "probes", "radius", "warnings")
     return {
         **{name: getattr(evaluation, name) for name in scores},
         **{name: report[name] for name in names if name in report},
-        "probes": result.settings["probes"],  # with the stencil and radius that were chosen
+        "regime": report["calibration"] and report["calibration"]["regime"],
         "seconds": round(seconds, 1),
     }
 

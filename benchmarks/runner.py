@@ -73,6 +73,9 @@ def run(
     done = {_key(row["cell"]) for row in read_rows(path) if "result" in row}
     due = [cell for cell in cells if _key(cell) not in done]
     path.parent.mkdir(parents=True, exist_ok=True)
+    if path.exists() and not path.read_text().endswith("\n"):
+        with path.open("a") as file:
+            file.write("\n")  # a kill cut the last line short: leave it to itself
     failed = []
     about = {"commit": _commit(), "versions": versions()}
     with path.open("a") as file, _backend(backend):

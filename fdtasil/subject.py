@@ -9,6 +9,7 @@ from fdtasil.datasets import Dataset
 from fdtasil.environments import EnvironmentLike, EnvironmentPool
 from fdtasil.errors import SettingError
 from fdtasil.experts import Expert, ExpertLike, load_expert
+from fdtasil.experts.http_expert import is_http_url
 from fdtasil.experts.hub import is_hub_uri
 from fdtasil.presets import Preset
 from fdtasil.probes import EXACT, FORWARD, Probes
@@ -80,8 +81,10 @@ def open_subject(
         opened = None
         if expert is not None:
             opened = load_expert(expert, n, m, output=output, trust=trust)
-        # The hub's files are called by their commit, which `expert` may leave open.
-        by_path = isinstance(expert, (str, Path)) and not is_hub_uri(expert)
+        # The hub's files are called by their commit, which `expert` may leave open; the query of
+        # an address may hold a secret, which its name leaves out.
+        remote = is_hub_uri(expert) or is_http_url(expert)
+        by_path = isinstance(expert, (str, Path)) and not remote
         named = str(expert) if by_path else opened and opened.name
         yield Subject(opened, named, pool, name, n, m)
 
