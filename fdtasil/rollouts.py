@@ -121,31 +121,32 @@ def rollout(
     for first in range(0, len(seeds), len(members)):
         chunk = range(first, min(first + len(members), len(seeds)))
         environments = dict(zip(chunk, members, strict=False))
-        observations = {e: _reset(environments[e], int(seeds[e]), pool) for e in chunk}
+        alive = list(chunk)
+        batch = _observed([_reset(environments[e], int(seeds[e]), pool) for e in alive], pool)
         for step in range(horizon):
-            alive = list(observations)
-            if not alive:
-                break
-            batch = np.stack([observations[e] for e in alive])
             decision = behaviour(batch, [generators[e] for e in alive])
-            record.decide(alive, step, batch, decision)
+            allowed = record.decide(alive, step, batch, decision)
+            after, going = [], np.ones(len(alive), bool)
             for row, episode in enumerate(alive):
-                after, reward, terminated, truncated = _step(
-                    environments[episode], decision.action[row], record, pool
+                observation, reward, terminated, truncated = _step(
+                    environments[episode], allowed[row], record, pool
                 )
                 record.rewards[episode, step] = reward
                 record.terminated[episode] = terminated
-                observations[episode] = after
-                if terminated or truncated:
-                    del observations[episode]
+                after.append(observation)
+                going[row] = not (terminated or truncated)
             on_step(len(alive))
+            batch = _observed(after, pool)[going]
+            alive = [episode for row, episode in enumerate(alive) if going[row]]
+            if not alive:
+                break
     return record.episodes(seeds)
 
 
 def first_observations(pool: EnvironmentPool, seeds: Sequence[int]) -> np.ndarray:
     """Return the (E, n) float32 observations that episodes of these seeds start from."""
     (environment,) = pool.take(1)
-    return np.stack([_reset(environment, int(seed), pool) for seed in seeds])
+    return _observed([_reset(environment, int(seed), pool) for seed in seeds], pool)
 
 
 class _Record:
@@ -153,6 +154,7 @@ class _Record:
 
     def __init__(self, episodes: int, horizon: int, pool: EnvironmentPool) -> None:
         n, m = pool.boxes.observation_size, pool.boxes.action_size
+        self._low, self._high = pool.boxes.low, pool.boxes.high
         self.observations = np.zeros((episodes, horizon, n), np.float32)
         self.actions = np.zeros((episodes, horizon, m), np.float32)
         self.expert_actions = np.zeros((episodes, horizon, m), np.float32)
@@ -164,7 +166,8 @@ class _Record:
 
     def decide(
         self, alive: list[int], step: int, observations: np.ndarray, decision: Decision
-    ) -> None:
+    ) -> np.ndarray:
+        """Record a step's decision; return its actions within the bounds."""
         expected = (len(alive), self.actions.shape[2])
         if decision.action.shape != expected:
             raise EnvironmentFault(
@@ -178,6 +181,9 @@ class _Record:
         if decision.expert_action is not None:
             self.expert_actions[alive, step] = decision.expert_action
             self.answered[alive, step] = True
+        allowed = np.minimum(np.maximum(decision.action, self._low), self._high)
+        self.clipped_actions += int((allowed != decision.action).any(axis=1).sum())
+        return allowed
 
     def episodes(self, seeds: Sequence[int]) -> Episodes:
         return Episodes(
@@ -199,36 +205,39 @@ def _reset(environment: gymnasium.Env, seed: int, pool: EnvironmentPool) -> np.n
         observation, _ = environment.reset(seed=seed)
     except Exception as error:
         raise _crash(pool, f"reset(seed={seed})", error) from error
-    return _observed(observation, pool)
+    return observation
 
 
 def _step(
     environment: gymnasium.Env, action: np.ndarray, record: _Record, pool: EnvironmentPool
 ) -> tuple[np.ndarray, float, bool, bool]:
-    allowed = np.minimum(np.maximum(action, pool.boxes.low), pool.boxes.high)
-    record.clipped_actions += not np.array_equal(allowed, action)
     # MuJoCo resets an unstable simulation inside step() and says so only by its clock.
     data = getattr(environment.unwrapped, "data", None)
     before = getattr(data, "time", None)
     try:
-        observation, reward, terminated, truncated, _ = environment.step(allowed)
+        observation, reward, terminated, truncated, _ = environment.step(action)
     except Exception as error:
         raise _crash(pool, "step()", error) from error
     if before is not None and getattr(data, "time", before) < before:
         record.physics_resets += 1
-    return _observed(observation, pool), float(reward), bool(terminated), bool(truncated)
+    return observation, float(reward), bool(terminated), bool(truncated)
 
 
-def _observed(observation: np.ndarray, pool: EnvironmentPool) -> np.ndarray:
-    row = np.asarray(observation, dtype=np.float32)
-    if row.shape != (pool.boxes.observation_size,) or not np.isfinite(row).all():
-        raise EnvironmentFault(
-            f"{pool.name} returned an observation of shape {row.shape}, "
-            f"{np.count_nonzero(~np.isfinite(row))} of its values not finite",
-            f"{pool.boxes.observation_size} finite numbers",
-            "mend the environment, or end the episode before it diverges",
-        )
-    return row
+def _observed(observations: Sequence[np.ndarray], pool: EnvironmentPool) -> np.ndarray:
+    """Return observations as one float32 array; looked at together, for it is quicker so."""
+    expected = (pool.boxes.observation_size,)
+    if all(np.shape(row) == expected for row in observations):
+        batch = np.array(observations, np.float32)
+        if np.isfinite(batch).all():
+            return batch
+    rows = [np.asarray(row, np.float32) for row in observations]
+    bad = next(row for row in rows if row.shape != expected or not np.isfinite(row).all())
+    raise EnvironmentFault(
+        f"{pool.name} returned an observation of shape {bad.shape}, "
+        f"{np.count_nonzero(~np.isfinite(bad))} of its values not finite",
+        f"{expected[0]} finite numbers",
+        "mend the environment, or end the episode before it diverges",
+    )
 
 
 def _crash(pool: EnvironmentPool, call: str, error: Exception) -> EnvironmentFault:
