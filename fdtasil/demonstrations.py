@@ -1,12 +1,13 @@
 """States, expert actions and probe answers: made, pooled, kept on disk."""
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 
-from fdtasil.errors import ExpertError, SettingError
+from fdtasil.errors import ExpertError, FdtasilWarning, SettingError
 from fdtasil.experts import Expert
 from fdtasil.probes import Probes
 from fdtasil.rollouts import Episodes
@@ -25,6 +26,9 @@ __all__ = [
 _STILL = 1e-4
 # The normaliser divides by no less than this share of the median deviation.
 _FLOOR = 1e-2
+# States that a design is shown: enough to tell which displacements can occur.
+_SHOWN = 4096
+_MUCH = 2**30  # bytes of answers that are announced before they are asked
 _ROUNDING = 64 * float(np.finfo(np.float32).eps)
 
 
@@ -200,7 +204,8 @@ def ask_probes(
     assert probes.stencil is not None, "the order sets the stencil"
     reach = 1.0 if probes.space == "raw" else probes.directions.reach(len(live))
     step = 1.0 if probes.stencil.exact else probes.radius * reach
-    states = observations[:, live] / (step * step_scale[live])
+    shown = np.linspace(0, len(observations) - 1, min(len(observations), _SHOWN)).astype(int)
+    states = observations[shown][:, live] / (step * step_scale[live])
     bank, numbers = probes.directions.draw(len(observations), states, random)
     displacements = np.zeros((len(bank), len(step_scale)), np.float32)
     displacements[:, live] = step * bank * step_scale[live]
@@ -223,15 +228,30 @@ def _ask_values(
     states, count = numbers.shape
     block = max(1, 65536 // (count * len(offsets)))
     shifts = np.asarray(offsets, np.float32)[:, None]
-    parts = []
+    values: np.ndarray | None = None
     for start in range(0, states, block):
         rows = slice(start, start + block)
         moved = displacements[numbers[rows]][:, :, None, :] * shifts
         points = observations[rows, None, None, :] + moved
         _check_moved(points, observations[rows], displacements)
         answers = expert.ask(points.reshape(-1, points.shape[-1]), "probe")
-        parts.append(answers.reshape(*points.shape[:3], -1))
-    return np.concatenate(parts)
+        if values is None:  # the first block says how long an action is
+            values = np.empty((states, count, len(offsets), answers.shape[1]), np.float32)
+            _announce(values)
+        values[rows] = answers.reshape(*points.shape[:3], -1)
+    assert values is not None, "there is no demonstration without a state"
+    return values
+
+
+def _announce(values: np.ndarray) -> None:
+    """Say what the answers take where that is much; the memory is not touched yet."""
+    if values.nbytes > _MUCH:
+        warnings.warn(
+            f"the expert's answers, {values.shape[0]:,} states x {values.shape[1]} probes, take "
+            f"{values.nbytes / 2**30:.1f} GiB of memory; fewer probes take less and teach alike",
+            FdtasilWarning,
+            stacklevel=4,
+        )
 
 
 def _check_moved(points: np.ndarray, centres: np.ndarray, displacements: np.ndarray) -> None:

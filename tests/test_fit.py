@@ -10,7 +10,7 @@ import torch
 from fdtasil.batches import Batches
 from fdtasil.compute import pick_device, torch_settings
 from fdtasil.demonstrations import Answers, Demonstrations, ask_probes, statistics
-from fdtasil.errors import FitError, SettingError
+from fdtasil.errors import FdtasilWarning, FitError, SettingError
 from fdtasil.experts import load_expert
 from fdtasil.fit import fit
 from fdtasil.presets import PRESETS
@@ -197,3 +197,10 @@ def test_a_device_that_is_not_there_is_refused(device):
         pytest.skip("this machine has a GPU")
     with pytest.raises(SettingError, match=f"device='{device}'"):
         pick_device(device)
+
+
+def test_answers_that_take_much_memory_are_announced_before_they_are_asked(monkeypatch):
+    monkeypatch.setattr("fdtasil.demonstrations._MUCH", 1000)
+    _, _, ask = linear_task(states=50, spec="5")
+    with pytest.warns(FdtasilWarning, match=r"50 states x 5 probes, take 0\.0 GiB"):
+        ask(0)
