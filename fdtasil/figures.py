@@ -77,13 +77,13 @@ def draw_calibration(found: "Calibration") -> bytes:
     change.set_ylabel("root mean square")
     agreement.plot(found.radii[1:], found.similarity[1:], color=_STUDENT, marker="o", markersize=3)
     agreement.set_ylim(-0.05, 1.05)
-    agreement.set_title("agreement of differences at a radius and a quarter of it", fontsize=9)
+    agreement.set_title("agreement of differences at r and r / 4", fontsize=9)
     agreement.set_ylabel("secant similarity")
     for panel in (change, agreement):
         name = f"radius {found.radius:.2g}, {found.stencil} ({found.regime})"
         panel.axvline(found.radius, color="#999999", linestyle="--", label=name)
         panel.set_xscale("log")
-        panel.set_xlabel("radius, standard deviations of each coordinate")
+        panel.set_xlabel("radius, standard deviations", fontsize=9)
         panel.grid(alpha=0.3, linewidth=0.5)
     change.legend(frameon=False, fontsize=7)
     return _png(figure)
