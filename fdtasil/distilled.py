@@ -47,8 +47,8 @@ class Distilled:
         >>> import fdtasil, numpy as np
         >>> result = fdtasil.distill(
         ...     lambda x: np.clip(-8 * np.arctan2(x[:, 1:2], x[:, :1]) - 2 * x[:, 2:], -2, 2),
-        ...     "Pendulum-v1", probes="sphere:2,forward", episodes=1, horizon=20, steps=20, hidden=(8,),
-        ...     evaluation_episodes=2,
+        ...     "Pendulum-v1", probes="sphere:2,forward", episodes=1, horizon=20, steps=20,
+        ...     hidden=(8,), evaluation_episodes=2,
         ... )
         >>> result.queries["probe"]
         40
