@@ -339,7 +339,12 @@ def script(tmp_path):
         file = tmp_path / "script.py"
         file.write_text(textwrap.dedent(SCRIPT).format(folder=folder, busy=busy))
         process = subprocess.Popen(
-            [sys.executable, str(file)], stderr=subprocess.PIPE, text=True, start_new_session=True
+            [sys.executable, str(file)],
+            stderr=subprocess.PIPE,
+            text=True,
+            start_new_session=True,
+            # A shell's background jobs ignore Ctrl-C, and their children with them.
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
         )
         started.append(process)
         end = time.monotonic() + 20
