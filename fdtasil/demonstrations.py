@@ -81,8 +81,19 @@ class Statistics:
     seen: np.ndarray
 
     def probed(self, space: str | None) -> np.ndarray:
-        """Return (n,) bool, the coordinates that are probed in a space."""
-        return self.seen if space == "raw" else self.seen & self.live
+        """Return (n,) bool, the coordinates that are probed in a space.
+
+        Raises:
+            SettingError: If there is none.
+        """
+        chosen = self.seen if space == "raw" else self.seen & self.live
+        if not chosen.any():
+            raise SettingError(
+                "the student sees no coordinate that moves",
+                "at least one",
+                "check student_obs, or pass probes=0",
+            )
+        return chosen
 
 
 @dataclass(frozen=True)
@@ -194,12 +205,6 @@ def ask_probes(
     deviation = 1.0 if probes.space == "raw" else scales.deviation
     step_scale = np.where(scales.probed(probes.space), deviation, 0.0)
     live = np.flatnonzero(step_scale)
-    if not len(live):
-        raise SettingError(
-            "the student sees no coordinate that moves",
-            "at least one",
-            "check student_obs, or pass probes=0",
-        )
     assert probes.radius is not None, "the preset sets the radius"
     assert probes.stencil is not None, "the order sets the stencil"
     reach = 1.0 if probes.space == "raw" else probes.directions.reach(len(live))

@@ -163,6 +163,7 @@ def distill(
         validation=validation,
         patience=patience,
     )
+    stored = given is not None and given.answers is not None
     source = source_of(probes, defaults, order, given, usual=DEFAULT_PROBES)
     if source is not None and callable(student_obs):
         source = source.with_order(order)  # a curved view allows the forward stencil only
@@ -184,10 +185,10 @@ def distill(
             probes=source,
             calibrated=source is not None
             and defaults.calibrates(source)
-            and not (given and given.answers)
+            and not stored
             and subject.expert is not None,
             usual_radius=defaults.radius,
-            probes_given=given is not None and given.answers is not None,
+            probes_given=stored,
             order=order if source else 0,
             observation_size=subject.observation_size,
             student_obs=describe_view(student_obs),

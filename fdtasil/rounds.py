@@ -316,7 +316,7 @@ class Rounds:
         self.dataset = Dataset.from_bytes(files["demonstrations.npz"])
         self.episodes, self.counts = state["episodes"], Counter(state["counts"])
         self._restore_ledger(state["queries"])
-        if state["calibration"] is not None and self.run.probes is not None:
+        if state["calibration"] and self.calibration is None and self.run.probes is not None:
             self.calibration = Calibration.from_json(state["calibration"])
             self.source = self.calibration.complete(self.run.probes)
         return True

@@ -8,7 +8,7 @@ import torch
 from conftest import GAIN, QUICK, TOY
 
 import fdtasil
-from fdtasil.errors import FdtasilWarning
+from fdtasil.errors import FdtasilWarning, SettingError
 
 EXPERTS = {
     "smooth": lambda x: np.tanh(x @ GAIN.T),
@@ -93,3 +93,8 @@ def test_a_resumed_run_takes_the_calibration_up(tmp_path):
     assert resumed.report["calibration"] == whole.report["calibration"]
     assert resumed.queries["calibrate"] == whole.queries["calibrate"]
     assert resumed.student.to_bytes() == whole.student.to_bytes()
+
+
+def test_a_student_that_sees_nothing_move_is_told_so(linear):
+    with pytest.raises(SettingError, match="sees no coordinate that moves"):
+        fdtasil.distill(linear, TOY, 3, student_obs=[4], **QUICK)
