@@ -5,13 +5,16 @@ import sys
 from pathlib import Path
 
 import benchmarks
+from benchmarks.finite_difference import FINITE_DIFFERENCE
 from benchmarks.non_differentiable import NON_DIFFERENTIABLE
 from benchmarks.quality import QUALITY
 from benchmarks.runner import FIGURES, RESULTS, Benchmark, read_rows, results_of, run
 from benchmarks.speed import SPEED
 from fdtasil.storage import write_bytes
 
-BENCHMARKS: dict[str, Benchmark] = {b.name: b for b in (QUALITY, NON_DIFFERENTIABLE, SPEED)}
+BENCHMARKS: dict[str, Benchmark] = {
+    b.name: b for b in (FINITE_DIFFERENCE, QUALITY, NON_DIFFERENTIABLE, SPEED)
+}
 
 
 def main() -> int:

@@ -107,7 +107,7 @@ class Answers:
         values: (N, k, p, m) float32 expert actions at state + offset * displacement for each of
             the stencil's p offsets; for an exact stencil they are the p first derivatives.
         gain: What turns a difference of values into the whitened Jacobian's Frobenius norm,
-            in expectation over directions: sqrt(d) / step.
+            in expectation over directions: sqrt(d) / step; 1 where values are matched as labels.
     """
 
     displacements: np.ndarray
@@ -214,7 +214,7 @@ def ask_probes(
     bank, numbers = probes.directions.draw(len(observations), states, random)
     displacements = np.zeros((len(bank), len(step_scale)), np.float32)
     displacements[:, live] = step * bank * step_scale[live]
-    gain = len(live) ** 0.5 / step
+    gain = len(live) ** 0.5 / step if probes.stencil.differences else 1.0
     if probes.stencil.exact:
         values = _differentiate(expert, observations, displacements, numbers, order)
     else:

@@ -88,7 +88,8 @@ def distill(
             each state, of states that can occur where those are few), "sphere:N" (N isotropic
             directions for each state, asked once), "sphere:N,resample" (asked anew while
             training), "orthogonal:N", "basis", "jacobian" (the analytic reference). Options
-            after commas: forward, central, radius=R, raw, whitened, per_step=K. Radius and
+            after commas: forward, central, labels (the answers are labels of the moved states,
+            and nothing is differenced), radius=R, raw, whitened, per_step=K. Radius and
             stencil that are left open are found by asking at a ladder of radii first.
         trainer: Who acts in which round: "bc" (the expert), "dagger" (a mixture of expert and
             student), "dart" (the expert with noise), or a trainer with settings of its own.

@@ -21,7 +21,7 @@ CELLS = [
     for source in SOURCES
     for stencil in ("forward", "central")
     if not (source == "none" and stencil == "central")
-] + [(trainer, "jacobian") for trainer in TRAINERS]
+] + [(trainer, source) for trainer in TRAINERS for source in ("jacobian", "sphere:3,labels")]
 QUICK = {"episodes": 4, "horizon": 10, "epochs": 5, "hidden": (8,), "evaluation_episodes": 1}
 
 

@@ -45,7 +45,9 @@ def states():
     return np.random.default_rng(0).standard_normal((40, 6)).astype(np.float32)
 
 
-@pytest.mark.parametrize("spec", ["5", "basis,central", "orthogonal:4", "jacobian"])
+@pytest.mark.parametrize(
+    "spec", ["5", "basis,central", "orthogonal:4", "jacobian", "sphere:5,labels"]
+)
 def test_the_loss_is_zero_at_the_expert(states, spec):
     expert = smooth_expert()
     batch, stencil, gain = batch_of(expert, spec, states)
@@ -82,6 +84,20 @@ def test_a_linear_difference_is_the_exact_derivative(states):
         batch, stencil, gain = batch_of(matrix, spec, states)
         loss = taylor_loss(lambda x: 0 * x[:, :3], batch, stencil, Weights(1.0), gain)
         assert float(loss.derivative) == pytest.approx(expected, rel=1e-4), spec
+
+
+def test_labels_are_the_action_error_at_the_moved_states(states):
+    expert, student = smooth_expert(), smooth_expert(m=3)
+    with torch.no_grad():
+        for parameter in student.parameters():
+            parameter.mul_(0.8)
+    batch, stencil, gain = batch_of(expert, "sphere:1,labels,radius=0.5", states)
+    loss = taylor_loss(student, batch, stencil, Weights(1.0), gain)
+    moved = batch.observations + batch.displacements[:, 0]
+    with torch.no_grad():
+        error = (student(moved) - expert(moved)).norm(dim=-1).mean()
+    assert float(loss.derivative) == pytest.approx(float(error), rel=1e-4)
+    assert float(loss.total) == pytest.approx(float(loss.action + error), rel=1e-4)
 
 
 def test_second_differences_agree_with_exact_second_derivatives():

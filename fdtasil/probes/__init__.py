@@ -12,13 +12,14 @@ from fdtasil.probes.directions import (
     StandardBasis,
 )
 from fdtasil.probes.source import DIRECTIONS, Probes
-from fdtasil.probes.stencils import CENTRAL, EXACT, FORWARD, STENCILS, Stencil
+from fdtasil.probes.stencils import CENTRAL, EXACT, FORWARD, LABELS, STENCILS, Stencil
 
 __all__ = [
     "CENTRAL",
     "DIRECTIONS",
     "EXACT",
     "FORWARD",
+    "LABELS",
     "STENCILS",
     "AdaptiveDirections",
     "Directions",

@@ -15,7 +15,7 @@ from fdtasil.probes.directions import (
     RandomSphere,
     StandardBasis,
 )
-from fdtasil.probes.stencils import CENTRAL, EXACT, FORWARD, STENCILS, Stencil
+from fdtasil.probes.stencils import CENTRAL, EXACT, FORWARD, LABELS, STENCILS, Stencil
 
 __all__ = ["DIRECTIONS", "Probes"]
 
@@ -35,7 +35,8 @@ class Probes:
 
     Attributes:
         directions: Where.
-        stencil: How: `FORWARD`, `CENTRAL`, or `EXACT` (a differentiable expert only). None
+        stencil: How: `FORWARD`, `CENTRAL`, `LABELS` (no difference: augmentation, the rival that
+            benchmarks compare with), or `EXACT` (a differentiable expert only). None
             leaves it to the calibration, or is forward for first order and central for second.
         radius: How far. Whitened space: standard deviations moved by each coordinate that moves
             (root mean square). Raw space: Euclidean length of the displacement.
@@ -90,7 +91,7 @@ class Probes:
         Args:
             spec: 0 or "none" (plain behaviour cloning), N (N adaptive directions), or a text
                 `design[:count][,option...]`: designs adaptive, basis, sphere, orthogonal,
-                jacobian; options forward, central, resample, whitened, raw, radius=R,
+                jacobian; options forward, central, labels, resample, whitened, raw, radius=R,
                 per_step=K. A `Probes` is returned as it is.
 
         Returns:
@@ -209,6 +210,7 @@ def _parse_option(option: str, spec: str) -> dict[str, object]:
     flags: dict[str, dict[str, object]] = {
         "forward": {"stencil": FORWARD},
         "central": {"stencil": CENTRAL},
+        "labels": {"stencil": LABELS},
         "resample": {"resample": True},
         "whitened": {"space": "whitened"},
         "raw": {"space": "raw"},

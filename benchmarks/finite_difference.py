@@ -1,0 +1,87 @@
+"""The paper's finite-difference appendix: how many probes stand in for the Jacobian."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from benchmarks.controllers import available
+from benchmarks.distillation import distil_cell
+from benchmarks.runner import Benchmark, Cell, Row
+
+__all__ = ["FINITE_DIFFERENCE"]
+
+ENVIRONMENTS = ("Walker2d", "HalfCheetah", "Ant", "Humanoid")
+SEEDS = range(5)
+HORIZON = 300
+
+PRESETS: dict[str, dict[str, Any]] = {
+    # What a user gets who sets nothing.
+    "standard": {},
+    # The paper's sphere, radius, weight and optimiser, at the training cost of the other preset:
+    # 4,500 epochs with every probe in every step would take weeks on two cores.
+    "paper": {"preset": "paper", "steps": 4000},
+}
+# Presets and numbers of trajectories, the most telling first: what a cut sweep has is complete.
+GRID = (
+    ("standard", 5),
+    ("paper", 5),
+    ("standard", 2),
+    ("standard", 20),
+    ("standard", 1),
+    ("paper", 20),
+    ("standard", 10),
+    ("standard", 50),
+)
+METHODS: dict[str, dict[str, dict[str, Any]]] = {
+    "standard": {
+        "plain": {"probes": 0},
+        "jacobian": {"probes": "jacobian"},
+        **{str(count): {"probes": count} for count in (1, 5, 10, 50)},
+        # A moved state's label counts as much as a visited state's.
+        "augmentation": {"probes": "adaptive:10,labels", "weight": 1.0},
+    },
+    "paper": {
+        "plain": {"probes": 0},
+        "jacobian": {"probes": "jacobian,per_step=1"},
+        **{str(count): {"probes": f"sphere:{count},per_step=1"} for count in (1, 5, 10, 50)},
+        "augmentation": {"probes": "sphere:10,labels,per_step=1", "weight": 1.0},
+    },
+}
+
+
+def cells(quick: bool) -> list[Cell]:
+    """Every preset, budget, seed, environment and method."""
+    return [
+        {"expert": expert, "preset": preset, "episodes": budget, "method": method, "seed": seed}
+        for preset, budget in (GRID[:1] if quick else GRID)
+        for seed in (range(2) if quick else SEEDS)
+        for expert in (experts()[:1] if quick else experts())
+        for method in METHODS[preset]
+    ]
+
+
+def experts() -> list[str]:
+    """Return the paper's experts where they are, this project's otherwise."""
+    here = available(*(f"paper/{name}" for name in ENVIRONMENTS))
+    return here or available(*(f"{name}-v5" for name in ENVIRONMENTS))
+
+
+def run(cell: Cell) -> dict[str, Any]:
+    """Distil by the cell's method, with its preset."""
+    preset, method = cell["preset"], cell["method"]
+    return distil_cell(
+        {
+            "expert": cell["expert"],
+            "episodes": cell["episodes"],
+            "seed": cell["seed"],
+            "horizon": HORIZON,
+            **PRESETS[preset],
+            **METHODS[preset][method],
+        }
+    )
+
+
+def draw(rows: Sequence[Row]) -> dict[str, bytes]:
+    raise NotImplementedError
+
+
+FINITE_DIFFERENCE = Benchmark("finite_difference", __doc__ or "", cells, run, draw)
