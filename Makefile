@@ -1,10 +1,10 @@
-# make demo, make test: each makes the environment first, if need be.
+# make demo, make test, make torture: each makes the environment first, if need be.
 PYTHON ?= python3
 BIN = .venv/bin
 # One thread per process: several at once on few cores are many times slower otherwise.
 export OMP_NUM_THREADS = 1
 
-.PHONY: demo test lint types check clean
+.PHONY: demo test torture lint types check clean
 
 demo: .venv/ready
 	$(BIN)/fdtasil distill experts/HalfCheetah-v5.onnx HalfCheetah-v5 --probes 10 \
@@ -12,6 +12,10 @@ demo: .venv/ready
 
 test: .venv/ready
 	$(BIN)/python -m pytest -q -n 2 -m "not slow"
+
+# Everything, in under an hour, and a table of what was survived.
+torture: .venv/ready
+	$(BIN)/python -m pytest -q -n 2 --figures
 
 lint: .venv/ready
 	$(BIN)/ruff check .

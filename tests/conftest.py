@@ -8,6 +8,7 @@ import onnx
 import pytest
 import torch
 from onnx import TensorProto, helper, numpy_helper
+from faults import FAULTS, LEFT_OUT
 from toy_environments import Integrator
 
 import fdtasil
@@ -17,6 +18,42 @@ TOY = "toy_environments:toy/Integrator-v0"
 QUICK = {"episodes": 2, "steps": 40, "hidden": (16,), "evaluation_episodes": 2, "horizon": 20}
 
 SHARED = Path(__file__).parent.parent.parent / "shared"
+
+
+def pytest_addoption(parser):
+    parser.addoption("--figures", action="store_true", help="print what was survived, at the end")
+
+
+def pytest_collection_modifyitems(items):
+    for item in items:
+        numbers = [n for mark in item.iter_markers("fault") for n in mark.args]
+        item.user_properties += [("fault", number) for number in numbers]
+
+
+def pytest_terminal_summary(terminalreporter, config):
+    """Print the table of figures: by part, the faults that ended as required, and the counts."""
+    if not config.getoption("--figures"):
+        return
+    kinds = ("passed", "failed", "error")
+    reports = [report for kind in kinds for report in terminalreporter.getreports(kind)]
+    properties = [(report.passed, *pair) for report in reports for pair in report.user_properties]
+    bad = {value for passed, name, value in properties if name == "fault" and not passed}
+    good = {value for passed, name, value in properties if name == "fault" and passed} - bad
+    lines = ["| faults in | listed | tested | ended as required |", "|---|---|---|---|"]
+    for part, faults in {**FAULTS, "all": {n: "" for f in FAULTS.values() for n in f}}.items():
+        tested = len(faults.keys() & (good | bad))
+        lines.append(f"| {part} | {len(faults)} | {tested} | {len(faults.keys() & good)} |")
+    lines += ["", "| put to the test | result |", "|---|---|"]
+    figures = {tuple(value) for passed, name, value in properties if name == "figure" and passed}
+    lines += [f"| {what} | {result} |" for what, result in sorted(figures)]
+    lines += ["", *(f"left out: {number}, {reason}" for number, reason in LEFT_OUT.items())]
+    terminalreporter.write_line("\n" + "\n".join(lines))
+
+
+@pytest.fixture
+def figure(record_property):
+    """Put a line into the table of figures: what was done, and what came of it."""
+    return lambda what, result: record_property("figure", (what, result))
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -163,8 +163,9 @@ def kill_and_resume(expert, folder, delay):
     return alive
 
 
-@pytest.mark.parametrize("kills", [2, pytest.param(20, marks=pytest.mark.slow)])
-def test_kills_at_random_moments(kills, expert, tmp_path):
+@pytest.mark.fault(108, 115)
+@pytest.mark.parametrize("kills", [2, pytest.param(200, marks=pytest.mark.slow)])
+def test_kills_at_random_moments(kills, expert, tmp_path, figure):
     assert child(expert, tmp_path / "golden", "out").wait() == 0
     start = time.perf_counter()
     assert child(expert, tmp_path / "again", "out").wait() == 0
@@ -177,3 +178,7 @@ def test_kills_at_random_moments(kills, expert, tmp_path):
         killed += kill_and_resume(expert, folder, moments.uniform(0, 0.6 * length))
         assert read(folder) == expected
     assert killed >= kills // 2
+    figure(
+        "kills at random moments",
+        f"{killed} of {kills} runs killed, {kills} resumed to the golden bytes",
+    )
