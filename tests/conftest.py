@@ -7,8 +7,8 @@ import numpy as np
 import onnx
 import pytest
 import torch
-from onnx import TensorProto, helper, numpy_helper
 from faults import FAULTS, LEFT_OUT
+from onnx import TensorProto, helper, numpy_helper
 from toy_environments import Integrator
 
 import fdtasil
