@@ -275,14 +275,22 @@ COMMANDS: dict[str, Callable[..., None]] = {
 
 
 def main() -> None:
-    """Run the command line; exit code 0 done, 1 failed, 2 wrong use."""
+    """Run the command line; exit code 0 done, 1 failed, 2 wrong use, 128 + N signal N."""
     try:
         tyro.extras.subcommand_cli_from_dict(
             COMMANDS, prog="fdtasil", description="Distil a black-box controller.", config=()
         )
     except FdtasilError as error:
-        print(f"fdtasil: {error}", file=sys.stderr)
+        print("\n  ".join([f"fdtasil: {error}", *_notes(error)]), file=sys.stderr)
         sys.exit(2 if isinstance(error, SettingError) else 1)
-    except KeyboardInterrupt:
-        print("fdtasil: interrupted", file=sys.stderr)
+    except KeyboardInterrupt as error:
+        print("; ".join(["fdtasil: interrupted", *_notes(error)]), file=sys.stderr)
         sys.exit(130)
+    except SystemExit as error:
+        if _notes(error):  # of a run that was told to end
+            print("; ".join(["fdtasil: terminated", *_notes(error)]), file=sys.stderr)
+        raise
+
+
+def _notes(error: BaseException) -> list[str]:
+    return getattr(error, "__notes__", [])

@@ -14,6 +14,7 @@ from fdtasil.environments import EnvironmentLike, EnvironmentPool, resolve_horiz
 from fdtasil.evaluation import Evaluation, compare
 from fdtasil.events import Callback, Event, tell_all
 from fdtasil.experts import Expert, ExpertLike, check_expert, load_expert
+from fdtasil.interrupts import Interrupts
 from fdtasil.presets import preset_of
 from fdtasil.probes import Probes
 from fdtasil.progress import Stages
@@ -209,25 +210,28 @@ def distill(
         place_of_run = out if resume is None else resume
         folder = None if place_of_run is None else Path(place_of_run)
         config = {**run.to_json(), "versions": versions()}
-        kept = RunFolder(folder, config, resume=resume is not None)
-        if folder and kept.finished and resume is not None:
-            return Distilled.load(folder, student_obs)
-        told = tell_all(callback, log_formats, folder)
-        rounds = Rounds(
-            run,
-            subject.expert,
-            subject.pool,
-            student_obs,
-            place,
-            Stages(progress),
-            kept,
-            told,
-            given,
-        )
-        result = _go(rounds, subject, notes, force=force)
-    if folder:
-        result.save(folder)
-        kept.close()
+        with (
+            RunFolder(folder, config, resume=resume is not None) as kept,
+            Interrupts() as interrupts,
+        ):
+            if folder and kept.finished and resume is not None:
+                return Distilled.load(folder, student_obs)
+            rounds = Rounds(
+                run,
+                subject.expert,
+                subject.pool,
+                student_obs,
+                place,
+                Stages(progress),
+                kept,
+                interrupts,
+                tell_all(callback, log_formats, folder),
+                given,
+            )
+            result = _go(rounds, subject, notes, force=force)
+            if folder:
+                result.save(folder)
+                kept.close()
     return result
 
 

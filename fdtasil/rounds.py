@@ -26,6 +26,7 @@ from fdtasil.events import Callback, Event
 from fdtasil.experts import Expert
 from fdtasil.fit import Hooks, fit
 from fdtasil.fitstate import FitState
+from fdtasil.interrupts import Interrupts
 from fdtasil.probes import Probes
 from fdtasil.progress import Stages
 from fdtasil.rollouts import Behaviour, Episodes, rollout
@@ -54,6 +55,7 @@ class Rounds:
         device: Where the student is trained.
         stages: Progress bars.
         folder: Where every stage is kept.
+        interrupts: Which wait for a checkpoint while a student is trained.
         callback: Told of events.
         dataset: All labelled states so far and the answers around them.
         student: The last round's.
@@ -74,6 +76,7 @@ class Rounds:
     device: torch.device
     stages: Stages
     folder: RunFolder
+    interrupts: Interrupts
     callback: Callback
     dataset: Dataset | None = None
     student: Student | None = None
@@ -99,8 +102,9 @@ class Rounds:
                     self._probe_given()
                 self._keep_collected(round_)
             if not self._restore_trained(round_):
-                self._train(round_)
-                self._keep_trained(round_)
+                with self.interrupts.held_back():
+                    self._train(round_)
+                    self._keep_trained(round_)
             self.callback(Event("round", round_, self.steps, self.history[-1], self.student))
 
     @property
@@ -266,7 +270,7 @@ class Rounds:
 
         def checkpoint(state: FitState) -> None:
             nonlocal due
-            if time.monotonic() < due:
+            if time.monotonic() < due and not self.interrupts.due:
                 return
             about = {"pool": pools.number, "queries": self._ledger()}
             self.folder.save(
@@ -275,6 +279,7 @@ class Rounds:
                 state.step,
                 lambda: {"fit.safetensors": state.to_bytes(), "state.json": to_json(about)},
             )
+            self.interrupts.stop_if_due()
             due = time.monotonic() + CHECKPOINT_SECONDS
 
         return checkpoint

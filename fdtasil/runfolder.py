@@ -4,11 +4,14 @@ import json
 import shutil
 import warnings
 from collections.abc import Callable
+from contextlib import ExitStack
 from pathlib import Path
+from types import TracebackType
 from typing import Any
 
 from fdtasil.errors import FdtasilWarning, SettingError, StorageError
-from fdtasil.storage import MANIFEST, to_json, verify, write_bytes, write_folder
+from fdtasil.lock import FolderLock
+from fdtasil.storage import is_written, to_json, verify, write_bytes, write_folder
 
 __all__ = ["RunFolder"]
 
@@ -20,7 +23,8 @@ class RunFolder:
     """Where a run keeps what it must not lose. Without a path it keeps nothing.
 
     Checkpoints are folders `checkpoints/<round>/<stage>-<number>/`, each with a manifest as its
-    last file: one that has none, or does not verify, never counts.
+    last file: one that has none, or does not verify, never counts. Inside the block no other
+    process writes the folder; an error that leaves the block says how to go on.
 
     Args:
         path: The folder, or None.
@@ -28,31 +32,52 @@ class RunFolder:
         resume: Whether the folder holds this run's beginning.
 
     Raises:
-        SettingError: If there is nothing to resume, the folder's run has another configuration,
-            or a new run would overwrite an unfinished one.
-        StorageError: If the folder can't be written.
+        SettingError: On entering the block, if there is nothing to resume, the folder's run has
+            another configuration, or a new run would overwrite an unfinished one.
+        StorageError: If the folder can't be written, or another process writes it.
     """
 
     def __init__(self, path: Path | None, config: dict[str, Any], *, resume: bool) -> None:
-        self._path, self._config = path, config
-        if path is None:
-            return
-        if resume:
-            _check_same(_read_config(path), config, path)
-            return
-        if any((path / _CHECKPOINTS).glob("*/*")):
-            raise SettingError(
-                f"{path} holds an unfinished run",
-                "an empty folder, or a finished run (which is replaced)",
-                f'resume="{path}" (--resume {path}) to go on, or remove the folder',
-            )
+        self._path, self._config, self._resume = path, config, resume
+        self._lock = ExitStack()
+
+    def __enter__(self) -> "RunFolder":
+        if self._path is None:
+            return self
+        before = _read_config(self._path) if self._resume else None
+        with ExitStack() as lock:
+            lock.enter_context(FolderLock(self._path))
+            if before is not None:
+                _check_same(before, self._config, self._path)
+            elif self._begun:
+                raise SettingError(
+                    f"{self._path} holds an unfinished run",
+                    "an empty folder, or a finished run (which is replaced)",
+                    f"{_going_on(self._path)}, or remove the folder",
+                )
+            self._lock = lock.pop_all()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        traceback: TracebackType | None,
+    ) -> None:
+        if error is not None and self._begun:
+            error.add_note(f"what is done is kept: {_going_on(self._path)}")
+        self._lock.close()
+
+    @property
+    def _begun(self) -> bool:
+        return self._path is not None and any((self._path / _CHECKPOINTS).glob("*/*"))
 
     @property
     def finished(self) -> bool:
         """Whether the folder holds a finished run."""
         if self._path is None or (self._path / _CHECKPOINTS).exists():
             return False
-        return (self._path / MANIFEST).exists()
+        return is_written(self._path)
 
     def save(
         self, round_: int, stage: str, number: int, files: Callable[[], dict[str, bytes]]
@@ -79,7 +104,7 @@ class RunFolder:
         if self._path is None:
             return None
         for folder in _numbered(self._path / _CHECKPOINTS / str(round_), stage):
-            if not (folder / MANIFEST).exists():
+            if not is_written(folder):
                 continue  # the run ended while it was written
             try:
                 return verify(folder)
@@ -92,6 +117,10 @@ class RunFolder:
         """Drop the checkpoints of a run that is saved."""
         if self._path is not None:
             shutil.rmtree(self._path / _CHECKPOINTS, ignore_errors=True)
+
+
+def _going_on(path: Path | None) -> str:
+    return f'go on with resume="{path}" (--resume {path})'
 
 
 def _read_config(path: Path) -> dict[str, Any]:

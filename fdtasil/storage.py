@@ -1,19 +1,35 @@
-"""Files that are either whole or not there: unique temporary name, flush, rename, manifest."""
+"""Files that are either whole or not there: unique temporary name, flush, rename, manifest.
 
+A folder changes as one: its new files are made in a hidden folder inside it, whose manifest, the
+last of them, makes them count; then they are moved into place. Whoever reads a folder whose move
+was cut short finds the new files where they are.
+"""
+
+import contextlib
 import errno
 import hashlib
 import json
 import os
 import secrets
+import shutil
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 from fdtasil.errors import StorageError
 
-__all__ = ["MANIFEST", "sha256", "to_json", "verify", "write_bytes", "write_folder"]
+__all__ = [
+    "explain",
+    "is_written",
+    "sha256",
+    "to_json",
+    "verify",
+    "write_bytes",
+    "write_folder",
+]
 
 MANIFEST = "manifest.json"
+_COMING = ".coming"
 
 
 def sha256(data: bytes) -> str:
@@ -42,25 +58,35 @@ def write_bytes(path: Path, data: bytes) -> None:
             file.flush()
             os.fsync(file.fileno())
         temporary.replace(path)
+        _flush_names(path.parent)
     except OSError as error:
-        temporary.unlink(missing_ok=True)
-        raise _explain(error, path, len(data)) from error
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        raise explain(error, path, f"room and permission for {len(data):,} bytes") from error
 
 
 def write_folder(folder: Path, files: Mapping[str, bytes]) -> None:
-    """Write files, then a manifest with their sha256 as the last one.
+    """Write files and a manifest with their sha256: all of them, or none.
 
     Args:
-        folder: Where; made if it is not there.
+        folder: Where; made if it is not there. Other files in it stay.
         files: Content by name relative to `folder`.
 
     Raises:
-        StorageError: As `write_bytes`.
+        StorageError: As `write_bytes`; the folder then reads as before.
     """
+    coming = folder / _COMING
+    _move_in(folder)
+    try:
+        if coming.exists():
+            shutil.rmtree(coming)
+    except OSError as error:
+        raise explain(error, coming, "a folder that can be removed") from error
     for name, data in files.items():
-        write_bytes(folder / name, data)
+        write_bytes(coming / name, data)
     manifest = {name: sha256(data) for name, data in sorted(files.items())}
-    write_bytes(folder / MANIFEST, to_json(manifest))
+    write_bytes(coming / MANIFEST, to_json(manifest))
+    _move_in(folder)
 
 
 def verify(folder: Path) -> dict[str, bytes]:
@@ -73,8 +99,12 @@ def verify(folder: Path) -> dict[str, bytes]:
         StorageError: If the manifest or a file is missing, or a file is not the one written.
     """
     try:
-        manifest = json.loads((folder / MANIFEST).read_bytes())
-        files = {name: (folder / name).read_bytes() for name in manifest}
+        listed = _place(folder, MANIFEST).read_bytes()
+        manifest = json.loads(listed)
+        # Nothing but what we write: a manifest that was changed must not pass for a shorter one.
+        if to_json(manifest) != listed or not isinstance(manifest, dict):
+            raise ValueError(f"{MANIFEST} changed after writing")
+        files = {name: _place(folder, name).read_bytes() for name in manifest}
     except (OSError, ValueError) as error:
         raise StorageError(
             f"{folder}: {error}", "a folder written by save()", "check the path, or save again"
@@ -89,14 +119,61 @@ def verify(folder: Path) -> dict[str, bytes]:
     return files
 
 
-def _explain(error: OSError, path: Path, size: int) -> StorageError:
+def is_written(folder: Path) -> bool:
+    """Return whether a folder has a manifest: everything else was there before it."""
+    return _place(folder, MANIFEST).exists()
+
+
+def _place(folder: Path, name: str) -> Path:
+    """Return where a file of a folder is, which is not yet in place if a move was cut short."""
+    coming = folder / _COMING
+    early = coming / name
+    # Without its manifest, what is coming does not count; the manifest is the last to be moved.
+    return early if (coming / MANIFEST).exists() and early.exists() else folder / name
+
+
+def _move_in(folder: Path) -> None:
+    """Move the files that are coming into place, if they are all there."""
+    coming = folder / _COMING
+    try:
+        names = json.loads((coming / MANIFEST).read_bytes())
+    except (OSError, ValueError):
+        return
+    try:
+        for name in [*names, MANIFEST]:
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+            if (coming / name).exists():
+                (coming / name).replace(folder / name)
+        _flush_names(folder)
+        shutil.rmtree(coming)
+    except OSError as error:
+        raise explain(error, folder, "permission to move files") from error
+
+
+def _flush_names(folder: Path) -> None:
+    """Make the renames in a folder outlast a power failure."""
+    if os.name != "posix":
+        return
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
+
+
+def explain(error: OSError, path: Path, expected: str) -> StorageError:
+    """Return the error of storage that a failed system call amounts to."""
     next_steps = {
         errno.ENOSPC: "free some space and run again; what was there before is whole",
+        errno.EDQUOT: "free some space and run again; what was there before is whole",
         errno.EROFS: "choose a folder on a writable file system",
         errno.EACCES: "choose a folder that you may write to",
+        errno.ENAMETOOLONG: "choose a shorter name",
+        errno.ENOTDIR: "choose a path that does not lead through a file",
+        errno.EEXIST: "choose a folder, not a file",
     }
     return StorageError(
         f"can't write {path}: {error.strerror}",
-        f"room and permission for {size:,} bytes",
+        expected,
         next_steps.get(error.errno or 0, "check the path and run again"),
     )

@@ -16,6 +16,8 @@ ORDER = [
     "report",
     "rounds",
     "runfolder",
+    "lock",
+    "interrupts",
     "configuration",
     "figures",
     "calibration",
