@@ -49,20 +49,8 @@ def write_bytes(path: Path, data: bytes) -> None:
         StorageError: If the disk is full, the folder is read-only, or anything else of the kind;
             whatever stood at `path` is then still there, whole.
     """
-    # A name of its own for every write: two processes that share one lose files to each other.
-    temporary = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.tmp")
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        with temporary.open("xb") as file:
-            file.write(data)
-            file.flush()
-            os.fsync(file.fileno())
-        temporary.replace(path)
-        _flush_names(path.parent)
-    except OSError as error:
-        with contextlib.suppress(OSError):
-            temporary.unlink(missing_ok=True)
-        raise explain(error, path, f"room and permission for {len(data):,} bytes") from error
+    _write(path, data)
+    _flush_names(path.parent)
 
 
 def write_folder(folder: Path, files: Mapping[str, bytes]) -> None:
@@ -83,7 +71,9 @@ def write_folder(folder: Path, files: Mapping[str, bytes]) -> None:
     except OSError as error:
         raise explain(error, coming, "a folder that can be removed") from error
     for name, data in files.items():
-        write_bytes(coming / name, data)
+        _write(coming / name, data)
+    for place in {(coming / name).parent for name in files}:
+        _flush_names(place)
     manifest = {name: sha256(data) for name, data in sorted(files.items())}
     write_bytes(coming / MANIFEST, to_json(manifest))
     _move_in(folder)
@@ -124,6 +114,23 @@ def is_written(folder: Path) -> bool:
     return _place(folder, MANIFEST).exists()
 
 
+def _write(path: Path, data: bytes) -> None:
+    """Write a file of which a power failure may still lose the name."""
+    # A name of its own for every write: two processes that share one lose files to each other.
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.tmp")
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with temporary.open("xb") as file:
+            file.write(data)
+            file.flush()
+            os.fsync(file.fileno())
+        temporary.replace(path)
+    except OSError as error:
+        with contextlib.suppress(OSError):
+            temporary.unlink(missing_ok=True)
+        raise explain(error, path, f"room and permission for {len(data):,} bytes") from error
+
+
 def _place(folder: Path, name: str) -> Path:
     """Return where a file of a folder is, which is not yet in place if a move was cut short."""
     coming = folder / _COMING
@@ -154,11 +161,14 @@ def _flush_names(folder: Path) -> None:
     """Make the renames in a folder outlast a power failure."""
     if os.name != "posix":
         return
-    handle = os.open(folder, os.O_RDONLY)
     try:
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+        handle = os.open(folder, os.O_RDONLY)
+        try:
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+    except OSError as error:
+        raise explain(error, folder, "a disk that takes what is written") from error
 
 
 def explain(error: OSError, path: Path, expected: str) -> StorageError:

@@ -84,7 +84,7 @@ def test_stopped_again_and_again(expert, golden, tmp_path):
 
 
 def test_validation_and_best_weights_are_resumed(expert, tmp_path):
-    run = {**RUN, "trainer": "bc", "validation": 0.3, "patience": 50, "steps": 600}
+    run = {**RUN, "trainer": "bc", "validation": 0.3, "patience": 50, "steps": 300}
     fdtasil.distill(expert, TOY, out=tmp_path / "golden", **run)
     with pytest.raises(Stop):
         fdtasil.distill(expert, TOY, out=tmp_path / "run", callback=stop_at(3), **run)
