@@ -143,7 +143,7 @@ class Rounds:
         new = label(recorded, expert, first, round_)
         self.episodes += count
         self.counts["clipped_actions"] += recorded.clipped_actions
-        self.counts["physics_resets"] += recorded.physics_resets
+        self.counts["physics_resets"] += int(recorded.physics_resets.sum())
         self.counts["terminated_episodes"] += int(recorded.terminated.sum())
         bounds = pool.boxes.low, pool.boxes.high
         before, old = self.dataset, None
