@@ -183,7 +183,7 @@ def _read_boxes(environment: gymnasium.Env, name: str) -> Boxes:
 def _bound(bound: np.ndarray) -> np.ndarray:
     """Return bounds as float32; those as large as float32 itself are a way to say none."""
     wide = bound.astype(np.float64)
-    return np.where(np.abs(wide) > 1e30, np.sign(wide) * np.inf, wide).astype(np.float32)
+    return np.where(np.abs(wide) > 1e30, np.copysign(np.inf, wide), wide).astype(np.float32)
 
 
 def _flat_box(space: gymnasium.Space, name: str, role: str) -> gymnasium.spaces.Box:
@@ -195,5 +195,7 @@ def _flat_box(space: gymnasium.Space, name: str, role: str) -> gymnasium.spaces.
         "actions": "fdtasil distils continuous controllers; choose or wrap the environment so",
     }
     raise EnvironmentFault(
-        f"{name} has {role} {space}", "a Box of floats with one dimension", advice[role]
+        f"{name} has {role} {space}",
+        "a Box of floats with one dimension, of length 1 or more",
+        advice[role],
     )

@@ -125,7 +125,8 @@ def rollout(
             chunk = range(first, min(first + len(members), len(seeds)))
             environments = dict(zip(chunk, members, strict=False))
             alive = list(chunk)
-            batch = record.observed([record.reset(environments[e], e) for e in alive], alive, 0)
+            first_ones = [record.reset(environments[e], e) for e in alive]
+            batch = record.observed(first_ones, alive, None)
             for step in range(horizon):
                 decision = behaviour(batch, [generators[e] for e in alive])
                 allowed = record.decide(alive, step, batch, decision)
@@ -137,7 +138,7 @@ def rollout(
                     after.append(observation)
                 on_step(len(alive))
                 record.check_rewards(alive, step)
-                batch = record.observed(after, alive, step + 1)[going]
+                batch = record.observed(after, alive, step)[going]
                 alive = [episode for row, episode in enumerate(alive) if going[row]]
                 if not alive:
                     break
@@ -149,7 +150,7 @@ def first_observations(pool: EnvironmentPool, seeds: Sequence[int]) -> np.ndarra
     (environment,) = pool.take(1)
     record, numbers = _Record(seeds, 0, pool), range(len(seeds))
     with simulator_warnings():
-        return record.observed([record.reset(environment, e) for e in numbers], numbers, 0)
+        return record.observed([record.reset(environment, e) for e in numbers], numbers, None)
 
 
 class _Record:
@@ -211,14 +212,18 @@ class _Record:
         rewards = self.rewards[alive, step]
         if not np.isfinite(rewards).all():
             row = int((~np.isfinite(rewards)).argmax())
-            raise self._fault(
-                alive[row], step, f"the reward is {rewards[row]}", "a finite number"
-            )
+            raise self._fault(alive[row], step, f"the reward is {rewards[row]}", "a finite number")
 
     def observed(
-        self, observations: Sequence[np.ndarray], alive: Sequence[int], step: int
+        self, observations: Sequence[np.ndarray], alive: Sequence[int], step: int | None
     ) -> np.ndarray:
-        """Return observations as one float32 array; looked at together, for it is quicker so."""
+        """Return observations as one float32 array; looked at together, for it is quicker so.
+
+        Args:
+            observations: One for each of the episodes `alive`.
+            alive: Numbers of the episodes.
+            step: That they were returned by, or None for the reset.
+        """
         size = self.observations.shape[2]
         try:
             batch = np.array(observations)
