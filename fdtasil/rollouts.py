@@ -325,10 +325,11 @@ def _unstable(data: object) -> bool:
     numbers = getattr(getattr(data, "warning", None), "number", None)
     if numbers is None:
         return False
-    from mujoco import mjtWarning as kinds  # whoever has such data has loaded it
+    import mujoco  # whoever has such data has loaded it
 
-    bad = (kinds.mjWARN_BADQPOS, kinds.mjWARN_BADQVEL, kinds.mjWARN_BADQACC)
-    return any(numbers[int(kind)] for kind in bad)
+    kinds = (f"mjWARN_BAD{what}" for what in ("QPOS", "QVEL", "QACC"))
+    # getattr: the type stubs do not know the enumeration.
+    return any(numbers[int(getattr(getattr(mujoco, "mjtWarning"), kind))] for kind in kinds)
 
 
 def _described(answer: object) -> str:

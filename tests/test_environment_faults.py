@@ -283,12 +283,8 @@ RAISES, NAN, REWARD, SHAPE = (
 )
 BROKEN = [
     broken(RAISES, "raises", _raise, r"step\(\) raised ValueError: boom$"),
-    broken(
-        NAN, "one NaN", _nan, "^1 of the observation's 5 values are not finite .* value 2: nan$"
-    ),
-    broken(
-        NAN, "all infinite", lambda x, *rest: (x / 0, *rest), "^5 of the observation's 5 values"
-    ),
+    broken(NAN, "one NaN", _nan, "^1 of the observation's 5 values .* value 2: nan$"),
+    broken(NAN, "all infinite", lambda x, *rest: (x / 0, *rest), "^5 of the observation"),
     broken(NAN, "too large", lambda x, *rest: (x * 1e300, *rest), "not finite in float32"),
     broken(REWARD, "NaN", lambda x, _, *rest: (x, np.nan, *rest), "^the reward is nan$"),
     broken(REWARD, "-inf", lambda x, _, *rest: (x, -np.inf, *rest), "^the reward is -inf$"),
@@ -512,23 +508,22 @@ except KeyboardInterrupt:
 RUN = {**QUICK, "trainer": "dagger", "episodes": 6}
 
 
-def child(folder, how):
-    code = textwrap.dedent(CHILD).replace("{run!r}", repr(RUN))
+def start(*arguments):
+    here, before = str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")
     return subprocess.Popen(
-        [sys.executable, "-c", code, str(folder), how],
+        [sys.executable, *map(str, arguments)],
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
         start_new_session=True,
-        env={
-            **os.environ,
-            "PYTHONPATH": os.pathsep.join(
-                [str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")]
-            ),
-        },  # fmt: skip  # noqa: E501
+        env={**os.environ, "PYTHONPATH": os.pathsep.join([here, before])},
         # A shell's background jobs ignore Ctrl-C, and their children with them.
         preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
+
+
+def child(folder, how):
+    return start("-c", textwrap.dedent(CHILD).replace("{run!r}", repr(RUN)), folder, how)
 
 
 def goes_on(folder):
@@ -573,31 +568,11 @@ def test_ctrl_c_in_a_rollout_is_one_line_and_130(tmp_path):
     from conftest import mlp_onnx
 
     expert = mlp_onnx(tmp_path / "e.onnx")
-    command = [
-        "distill",
-        expert,
-        TOY,
-        "--evaluation-episodes",
-        "100000",
-        "--out",
-        tmp_path / "run",
-    ]
-    process = subprocess.Popen(
-        [sys.executable, "-m", "fdtasil", *map(str, command)],
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        text=True,
-        start_new_session=True,
-        env={
-            **os.environ,
-            "PYTHONPATH": os.pathsep.join(
-                [str(Path(__file__).parent), os.environ.get("PYTHONPATH", "")]
-            ),
-        },  # fmt: skip  # noqa: E501
-        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
-    )
+    run = tmp_path / "run"
+    long = ("--evaluation-episodes", 100_000)
+    process = start("-m", "fdtasil", "distill", expert, TOY, *long, "--out", run)
     end = time.monotonic() + 60
-    while not (tmp_path / "run" / "command.json").exists() and time.monotonic() < end:
+    while not (run / "command.json").exists() and time.monotonic() < end:
         time.sleep(0.05)
     time.sleep(2)  # past the gate's first questions
     began = time.monotonic()
@@ -620,7 +595,7 @@ def test_a_wrong_seed_is_refused_at_once(seed, linear):
         lambda: fdtasil.distill(linear, TOY, 1, **QUICK, seed=seed),
         lambda: fdtasil.evaluate(linear, linear, TOY, episodes=2, seed=seed),
     ):
-        with pytest.raises(SettingError, match="seed=.*\n.*an integer from 0 to 4294967295"):
+        with pytest.raises(SettingError, match=r"seed=.*\n.*an integer from 0 to 4294967295"):
             call()
 
 

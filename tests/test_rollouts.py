@@ -159,7 +159,7 @@ def test_a_silent_physics_reset_is_counted():
 
 def test_other_data_than_a_simulators_is_left_alone():
     class Trades(Integrator):
-        class data:  # noqa: N801
+        class data:
             time = np.arange(3)
 
     assert run(Trades, [0], horizon=3).physics_resets.tolist() == [0]
