@@ -328,8 +328,7 @@ def _unstable(data: object) -> bool:
     import mujoco  # whoever has such data has loaded it
 
     kinds = (f"mjWARN_BAD{what}" for what in ("QPOS", "QVEL", "QACC"))
-    # getattr: the type stubs do not know the enumeration.
-    return any(numbers[int(getattr(getattr(mujoco, "mjtWarning"), kind))] for kind in kinds)
+    return any(numbers[int(vars(mujoco)["mjtWarning"].__members__[kind])] for kind in kinds)
 
 
 def _described(answer: object) -> str:

@@ -2,6 +2,7 @@
 
 import json
 import time
+import warnings
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -21,7 +22,7 @@ from fdtasil.demonstrations import (
     statistics,
 )
 from fdtasil.environments import EnvironmentPool
-from fdtasil.errors import SettingError
+from fdtasil.errors import FdtasilWarning, SettingError
 from fdtasil.events import Callback, Event
 from fdtasil.experts import Expert
 from fdtasil.fit import Hooks, fit
@@ -219,6 +220,14 @@ class Rounds:
         """Train a fresh student on all demonstrations, as it sees them."""
         run, view, data = self.run, self.view, self.data
         seen = view.demonstrations(data.demonstrations)
+        complete = run.trainer is None or self.episodes == run.episodes
+        if complete and run.fit.validation > 0 and len(np.unique(seen.episode)) == 1:
+            warnings.warn(
+                f"validation={run.fit.validation:g} of a single episode: none is held out, and "
+                "the last weights are kept",
+                FdtasilWarning,
+                stacklevel=2,
+            )
         scales = statistics(seen.observations)
         shape = StudentShape(view.size, seen.actions.shape[1], run.hidden, run.activation)
         start = torch_generator(run.seed, "student", round_)
