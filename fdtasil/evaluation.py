@@ -245,7 +245,7 @@ def _interval(ours: np.ndarray, theirs: np.ndarray, seed: int) -> tuple[float, f
 
 def _imitation_gap(student: Episodes, expert: Episodes) -> float:
     both = student.valid & expert.valid
-    deviation = expert.observations[expert.valid].std(axis=0)
+    deviation = expert.observations[expert.valid].std(axis=0, dtype=np.float64)
     live = deviation > 1e-6
     if not live.any():
         return 0.0
