@@ -142,7 +142,7 @@ def test_a_training_that_diverges_leaves_no_number_that_is_not_finite(
     monkeypatch.setattr(rounds, "CHECKPOINT_SECONDS", 0.0)
     entries = []
     run = {**QUICK, "steps": 300, "batch_size": batch_size, "learning_rate": rate}
-    with pytest.raises(FitError, match="at step|after step") as error:
+    with pytest.raises(FitError, match=r"at step|after step") as error:
         fdtasil.distill(linear, TOY, 3, out=tmp_path, callback=entries.append, **run)
     assert len(str(error.value).splitlines()) <= 6
     assert "lower learning_rate" in error.value.next_step
