@@ -29,6 +29,7 @@ _STILL = 1e-4
 _FLOOR = 1e-2
 # States that a design is shown: enough to tell which displacements can occur.
 _SHOWN = 4096
+_ROWS = 2**15  # points made at once: 44 MiB each of Humanoid's, and some copies
 _MUCH = 2**30  # bytes of answers that are announced before they are asked
 _ROUNDED = 0.1  # share of a step that rounding may take before it is warned of
 _ROUNDING = 64 * float(np.finfo(np.float32).eps)
@@ -271,7 +272,7 @@ def _ask_values(
 ) -> np.ndarray:
     """Ask for the values at the stencil's points, a bounded number of rows at a time."""
     states, count = numbers.shape
-    block = max(1, 65536 // (count * len(offsets)))
+    block = max(1, _ROWS // (count * len(offsets)))
     shifts = np.asarray(offsets, np.float32)[:, None]
     values: np.ndarray | None = None
     for start in range(0, states, block):

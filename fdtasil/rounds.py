@@ -23,6 +23,7 @@ from fdtasil.demonstrations import (
 )
 from fdtasil.environments import EnvironmentPool
 from fdtasil.errors import FdtasilWarning, SettingError
+from fdtasil.evaluation import check_episodes
 from fdtasil.events import Callback, Event
 from fdtasil.experts import Expert
 from fdtasil.fit import Hooks, fit
@@ -141,6 +142,8 @@ class Rounds:
         behaviour = trainer.behaviour(Situation(round_, expert, policy, record_extra))
         first = self.episodes
         recorded = self._record(pool, behaviour, "rollout", first, count)
+        if round_ == 0:  # every trainer's expert acts alone there
+            check_episodes(recorded, pool.name)
         new = label(recorded, expert, first, round_)
         self.episodes += count
         self.counts["clipped_actions"] += recorded.clipped_actions

@@ -1,5 +1,7 @@
 """Finite differences that can't be taken: refused, warned of, or taken so that they are right."""
 
+import tracemalloc
+
 import gymnasium
 import numpy as np
 import pytest
@@ -194,6 +196,21 @@ def test_probes_that_no_memory_holds_are_refused(linear):
     with pytest.raises(SettingError, match="at 40 states does not fit into memory") as error:
         fdtasil.distill(linear, TOY, "sphere:1000000000000,forward", **QUICK)
     assert isinstance(error.value.__cause__, MemoryError)
+
+
+@pytest.mark.fault(91)
+def test_asking_takes_little_memory_beside_the_answers(figure):
+    """Of Humanoid's size; the points are made and asked a bounded number at a time."""
+    states = np.random.default_rng(0).standard_normal((8000, 348)).astype(np.float32)
+    tracemalloc.start()
+    try:
+        answers = asked(lambda rows: rows[:, :17], states, "sphere:10,forward,radius=0.3")
+        held, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert answers.values.shape == (8000, 10, 1, 17)
+    assert peak - held < 256 * 2**20
+    figure("memory beside the answers, 348 coordinates", f"{(peak - held) / 2**20:.0f} MiB")
 
 
 # --- centre and probes
