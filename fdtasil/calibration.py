@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from fdtasil.demonstrations import Statistics
+from fdtasil.demonstrations import Statistics, ask_moved
 from fdtasil.errors import FdtasilWarning
 from fdtasil.experts import Expert
 from fdtasil.probes import CENTRAL, FORWARD, Probes
@@ -50,6 +50,7 @@ _ROUGH = 0.62
 _ROUGH_RADIUS = 0.5
 _NOISY_FROM = 4.0**-6  # smallest radius with a derivative; float32 rounding stays below it
 _NOISY_SHARE = 0.3  # of noise in a difference; above it a given radius is warned of
+_FAR = 4.0  # standard deviations beyond which no demonstrated state lies, and none was asked about
 
 
 def ladder_for(probe_rows: int) -> Ladder:
@@ -109,13 +110,16 @@ class Calibration:
 
     def _warn_of(self, radius: float) -> None:
         change = float(np.interp(np.log(radius), np.log(self.radii), self.change))
+        change *= min(1.0, radius / self.radii[0])  # linear, nearer than anything that was asked
         noise = 2**0.5 * self.noise_floor
         coherent, best = self.similarity_at(radius), self.similarity_at(self.radius)
         reason = None
-        if self.regime == "noisy" and noise > _NOISY_SHARE * change:
+        if self.regime != "steps" and noise > _NOISY_SHARE * change:
             reason = f"{min(1.0, noise / change):.0%} of a difference there is noise"
         elif coherent < 0.5 * best:
             reason = f"differences there and at a quarter of it agree to {coherent:.2f} only"
+        elif radius > _FAR:
+            reason = "no demonstrated state lies that far from the others"
         if reason is not None:
             warnings.warn(
                 f"radius={radius:g}: {reason}; the calibration suggests {self.radius:.2g} "
@@ -153,7 +157,7 @@ def calibrate(
     moved = directions[:, None, None, :] * radii[None, :, None, None] * signs
     points = (observations[rows][:, None, None, :] + moved).astype(np.float32)
     centres = expert.ask(observations[rows], "calibrate").astype(np.float64)
-    answers = expert.ask(points.reshape(-1, len(scale)), "calibrate")
+    answers = ask_moved(expert, points.reshape(-1, len(scale)), "calibrate")
     values = answers.reshape(rays, len(radii), 2, -1).astype(np.float64)
     secants = (values[:, :, 0] - values[:, :, 1]) / (2 * radii[None, :, None])
     similarity = _similarity(secants[:, 1:], secants[:, :-1])

@@ -22,7 +22,7 @@ def pick_device(device: str) -> torch.device:
     """
     try:
         picked = torch.device(device)
-    except RuntimeError:
+    except (RuntimeError, TypeError):
         raise SettingError(
             f"device={device!r}", '"cpu", "cuda" or "cuda:N"', 'write device="cpu"'
         ) from None
@@ -31,6 +31,12 @@ def pick_device(device: str) -> torch.device:
             f"device={device!r}, and this torch ({torch.__version__}) sees no GPU",
             "a CUDA build of torch and a visible GPU",
             'write device="cpu", or install a CUDA build of torch',
+        )
+    if picked.type == "cuda" and (picked.index or 0) >= torch.cuda.device_count():
+        raise SettingError(
+            f"device={device!r}, and this torch sees {torch.cuda.device_count()} GPU(s)",
+            "the number of one of them, from 0",
+            'write device="cuda"',
         )
     if picked.type not in ("cpu", "cuda"):
         raise SettingError(f"device={device!r}", '"cpu" or "cuda"', 'write device="cpu"')

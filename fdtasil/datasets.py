@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from fdtasil.demonstrations import Answers, Demonstrations
-from fdtasil.errors import StorageError
+from fdtasil.errors import SettingError, StorageError
 from fdtasil.probes import Probes
 
 __all__ = ["Dataset", "DatasetLike", "load_dataset"]
@@ -94,13 +94,14 @@ def load_dataset(source: DatasetLike) -> Dataset:
 
     Raises:
         StorageError: If there are none.
+        SettingError: If they are empty, of shapes that do not go together, or not finite.
     """
     if isinstance(source, Dataset):
-        return source
+        return _checked(source)
     path = Path(source)
     file = path / "demonstrations.npz" if path.is_dir() else path
     try:
-        return Dataset.from_bytes(file.read_bytes())
+        return _checked(Dataset.from_bytes(file.read_bytes()))
     except OSError as error:
         if isinstance(error, StorageError):
             raise
@@ -109,6 +110,41 @@ def load_dataset(source: DatasetLike) -> Dataset:
             "a run folder, or its demonstrations.npz",
             "check the path",
         ) from error
+
+
+def _checked(dataset: Dataset) -> Dataset:
+    """Return a dataset that a student can be trained from: one NaN in it makes all weights NaN."""
+    states, answers = dataset.demonstrations, dataset.answers
+    arrays = dict(vars(states)) | {"low": dataset.low, "high": dataset.high}
+    shapes = {"observations": "Nn", "actions": "Nm", "taken": "Nm", "low": "m", "high": "m"}
+    shapes |= dict.fromkeys(("episode", "round", "rewards", "terminated"), "N")
+    if answers is not None:
+        arrays |= {name: getattr(answers, name) for name in ("displacements", "numbers", "values")}
+        shapes |= {"displacements": "Pn", "numbers": "Nk", "values": "Nkpm"}
+    sizes: dict[str, int] = {}
+    for name, letters in shapes.items():
+        shape = arrays[name].shape
+        agrees = len(shape) == len(letters) and all(
+            sizes.setdefault(letter, size) == size
+            for letter, size in zip(letters, shape, strict=True)
+        )
+        if not agrees or sizes["N"] == 0:
+            expected = ", ".join(f"{letter}={sizes.get(letter, 'any')}" for letter in letters)
+            raise SettingError(
+                f"demonstrations whose {name} have the shape {shape}",
+                f"({', '.join(letters)}) with {expected}, and N at least 1",
+                "record at least one episode, one row of each array for each state",
+            )
+    for name in ("observations", "actions", "displacements", "values"):
+        if name in arrays and not np.isfinite(arrays[name]).all():
+            bad = np.flatnonzero([not np.isfinite(row).all() for row in arrays[name]])
+            raise SettingError(
+                f"demonstrations whose {name} are not finite in {len(bad)} of "
+                f"{len(arrays[name])} rows, the first of them row {bad[0]}",
+                "finite numbers",
+                "drop these rows, and find out what made them",
+            )
+    return dataset
 
 
 def _read(arrays: dict[str, np.ndarray]) -> Dataset:

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from fdtasil.errors import ExpertError, FdtasilWarning, SettingError
-from fdtasil.experts import Expert
+from fdtasil.experts import Expert, Purpose
 from fdtasil.probes import Probes
 from fdtasil.rollouts import Episodes
 
@@ -16,6 +16,7 @@ __all__ = [
     "Answers",
     "Demonstrations",
     "Statistics",
+    "ask_moved",
     "ask_probes",
     "label",
     "statistics",
@@ -28,7 +29,9 @@ _STILL = 1e-4
 _FLOOR = 1e-2
 # States that a design is shown: enough to tell which displacements can occur.
 _SHOWN = 4096
+_ROWS = 2**15  # points made at once: 44 MiB each of Humanoid's, and some copies
 _MUCH = 2**30  # bytes of answers that are announced before they are asked
+_ROUNDED = 0.1  # share of a step that rounding may take before it is warned of
 _ROUNDING = 64 * float(np.finfo(np.float32).eps)
 
 
@@ -200,8 +203,44 @@ def ask_probes(
 
     Raises:
         ExpertError: If the stencil is exact and the expert can't be differentiated.
-        SettingError: If no coordinate moves, or a step is lost in rounding.
+        SettingError: If no coordinate moves, a step is lost in rounding or beyond float32, or
+            the answers do not fit into memory.
     """
+    try:
+        return _ask_probes(expert, observations, probes, scales, random, order)
+    except MemoryError as error:
+        raise SettingError(
+            f"{probes.describe()!r} at {len(observations):,} states does not fit into memory",
+            "answers that do",
+            "pass fewer probes: they teach alike",
+        ) from error
+
+
+def ask_moved(expert: Expert, points: np.ndarray, purpose: Purpose) -> np.ndarray:
+    """Ask an expert about states that were moved, and say so where it can't answer.
+
+    Raises:
+        ExpertError: As `Expert.ask`.
+    """
+    try:
+        return expert.ask(points, purpose)
+    except ExpertError as error:
+        raise ExpertError(
+            f"{error.found} (states moved by probes)",
+            error.expected,
+            f"{error.next_step}; probes leave the bounds of the observations, so it must answer "
+            "there as well, or the radius be smaller",
+        ) from error
+
+
+def _ask_probes(
+    expert: Expert,
+    observations: np.ndarray,
+    probes: Probes,
+    scales: Statistics,
+    random: np.random.Generator,
+    order: int,
+) -> Answers:
     deviation = 1.0 if probes.space == "raw" else scales.deviation
     step_scale = np.where(scales.probed(probes.space), deviation, 0.0)
     live = np.flatnonzero(step_scale)
@@ -213,7 +252,9 @@ def ask_probes(
     states = observations[shown][:, live] / (step * step_scale[live])
     bank, numbers = probes.directions.draw(len(observations), states, random)
     displacements = np.zeros((len(bank), len(step_scale)), np.float32)
-    displacements[:, live] = step * bank * step_scale[live]
+    with np.errstate(over="ignore"):  # looked at in the next line
+        displacements[:, live] = step * bank * step_scale[live]
+    _check_steps(displacements, observations, probes)
     gain = len(live) ** 0.5 / step if probes.stencil.differences else 1.0
     if probes.stencil.exact:
         values = _differentiate(expert, observations, displacements, numbers, order)
@@ -231,7 +272,7 @@ def _ask_values(
 ) -> np.ndarray:
     """Ask for the values at the stencil's points, a bounded number of rows at a time."""
     states, count = numbers.shape
-    block = max(1, 65536 // (count * len(offsets)))
+    block = max(1, _ROWS // (count * len(offsets)))
     shifts = np.asarray(offsets, np.float32)[:, None]
     values: np.ndarray | None = None
     for start in range(0, states, block):
@@ -239,7 +280,7 @@ def _ask_values(
         moved = displacements[numbers[rows]][:, :, None, :] * shifts
         points = observations[rows, None, None, :] + moved
         _check_moved(points, observations[rows], displacements)
-        answers = expert.ask(points.reshape(-1, points.shape[-1]), "probe")
+        answers = ask_moved(expert, points.reshape(-1, points.shape[-1]), "probe")
         if values is None:  # the first block says how long an action is
             values = np.empty((states, count, len(offsets), answers.shape[1]), np.float32)
             _announce(values)
@@ -254,6 +295,33 @@ def _announce(values: np.ndarray) -> None:
         warnings.warn(
             f"the expert's answers, {values.shape[0]:,} states x {values.shape[1]} probes, take "
             f"{values.nbytes / 2**30:.1f} GiB of memory; fewer probes take less and teach alike",
+            FdtasilWarning,
+            stacklevel=4,
+        )
+
+
+def _check_steps(displacements: np.ndarray, observations: np.ndarray, probes: Probes) -> None:
+    """Refuse steps that float32 can't hold beside the states, and warn of those that it rounds."""
+    squares = displacements.astype(np.float64) ** 2
+    sizes = np.sqrt(squares.sum(axis=0) / np.maximum(np.count_nonzero(squares, axis=0), 1))
+    wide = np.abs(displacements).max() + np.abs(observations).max()
+    if not np.isfinite(wide) or not sizes.any():
+        raise SettingError(
+            f"radius={probes.radius:g} moves a state by {sizes.max():g}",
+            "steps that float32 can add to the observations",
+            "leave radius= out, or write for example radius=0.3",
+        )
+    if probes.exact:
+        return
+    values = np.sqrt((observations.astype(np.float64) ** 2).mean(axis=0)).astype(np.float32)
+    errors = np.spacing(values) / 12**0.5  # root mean square, of rounding to the nearest
+    shares = np.where(sizes > 0, errors / np.where(sizes > 0, sizes, 1), 0)
+    worst = int(shares.argmax())
+    if shares[worst] > _ROUNDED:
+        warnings.warn(
+            f"float32 rounds away {min(1.0, shares[worst]):.0%} of the step along coordinate "
+            f"{worst}, of {sizes[worst]:.2g} beside values of {values[worst]:.2g}: raise the "
+            "radius, or probe in whitened space",
             FdtasilWarning,
             stacklevel=4,
         )

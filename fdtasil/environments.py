@@ -12,7 +12,7 @@ import numpy as np
 
 from fdtasil.errors import EnvironmentFault, FdtasilWarning, SettingError
 
-__all__ = ["EnvironmentLike", "EnvironmentPool", "resolve_horizon"]
+__all__ = ["EnvironmentLike", "EnvironmentPool", "resolve_horizon", "simulator_warnings"]
 
 EnvironmentLike = str | gymnasium.Env | Callable[[], gymnasium.Env]
 
@@ -93,7 +93,7 @@ class EnvironmentPool:
 
     def _new(self) -> gymnasium.Env:
         try:
-            with _model_warnings_kept():
+            with simulator_warnings():
                 made = self._make()
         except Exception as error:  # a factory is the caller's code and may raise anything
             first_line = (str(error).splitlines() or [type(error).__name__])[0]
@@ -130,27 +130,26 @@ def resolve_horizon(horizon: int | None, pool: EnvironmentPool) -> int:
 
 
 @contextmanager
-def _model_warnings_kept() -> Iterator[None]:
-    """Pass MuJoCo's warnings about a model on to Python, where equal ones are shown once.
+def simulator_warnings() -> Iterator[None]:
+    """Pass MuJoCo's warnings on to Python, each once, when the block ends.
 
-    It would print each for every copy of the environment; those of a deprecated attribute in
-    gymnasium's own model files tell a user nothing.
+    MuJoCo itself would print each for every copy of the environment, and write it into a file
+    MUJOCO_LOG.TXT of the working folder. Those of a deprecated attribute in gymnasium's own model
+    files tell a user nothing; those of unstable physics are counted by rollouts.
     """
     import mujoco
 
     # getattr: the type stubs do not know these two functions.
     get, put = (getattr(mujoco, f"{verb}_mju_user_warning") for verb in ("get", "set"))
-    before = get()
-    put(_pass_on)
+    before, messages = get(), dict[str, None]()
+    put(lambda message: messages.update({message: None}))
     try:
         yield
     finally:
         put(before)
-
-
-def _pass_on(message: str) -> None:
-    if "deprecated" not in message:
-        warnings.warn(f"MuJoCo: {message}", FdtasilWarning, stacklevel=2)
+    for message in messages:
+        if "deprecated" not in message and "simulation is unstable" not in message:
+            warnings.warn(f"MuJoCo: {message}", FdtasilWarning, stacklevel=4)
 
 
 def _factory(environment: EnvironmentLike) -> Callable[[], gymnasium.Env]:
@@ -172,8 +171,9 @@ def _read_boxes(environment: gymnasium.Env, name: str) -> Boxes:
     action = _flat_box(environment.action_space, name, "actions")
     low, high = (_bound(bound) for bound in (action.low, action.high))
     if not (low < high).all():
+        first = int((~(low < high)).argmax())
         raise EnvironmentFault(
-            f"{name}: action bounds {low} to {high}",
+            f"{name}: action {first} has the bounds {low[first]:g} to {high[first]:g}",
             "lower bounds below upper bounds",
             "drop the fixed actions with a gymnasium.ActionWrapper",
         )
@@ -183,11 +183,11 @@ def _read_boxes(environment: gymnasium.Env, name: str) -> Boxes:
 def _bound(bound: np.ndarray) -> np.ndarray:
     """Return bounds as float32; those as large as float32 itself are a way to say none."""
     wide = bound.astype(np.float64)
-    return np.where(np.abs(wide) > 1e30, np.sign(wide) * np.inf, wide).astype(np.float32)
+    return np.where(np.abs(wide) > 1e30, np.copysign(np.inf, wide), wide).astype(np.float32)
 
 
 def _flat_box(space: gymnasium.Space, name: str, role: str) -> gymnasium.spaces.Box:
-    if isinstance(space, gymnasium.spaces.Box) and len(space.shape) == 1:
+    if isinstance(space, gymnasium.spaces.Box) and len(space.shape) == 1 and space.shape[0] > 0:
         if np.issubdtype(space.dtype, np.floating):
             return space
     advice = {
@@ -195,5 +195,7 @@ def _flat_box(space: gymnasium.Space, name: str, role: str) -> gymnasium.spaces.
         "actions": "fdtasil distils continuous controllers; choose or wrap the environment so",
     }
     raise EnvironmentFault(
-        f"{name} has {role} {space}", "a Box of floats with one dimension", advice[role]
+        f"{name} has {role} {space}",
+        "a Box of floats with one dimension, of length 1 or more",
+        advice[role],
     )

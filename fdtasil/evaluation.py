@@ -8,12 +8,19 @@ from typing import Any
 import numpy as np
 
 from fdtasil.environments import EnvironmentPool
-from fdtasil.errors import FdtasilWarning
+from fdtasil.errors import EnvironmentFault, FdtasilWarning
 from fdtasil.experts import Expert
 from fdtasil.rollouts import Behaviour, Decision, Episodes, Policy, follow, rollout
 from fdtasil.seeding import generator
 
-__all__ = ["Evaluation", "compare", "interval_text", "random_behaviour", "score_text"]
+__all__ = [
+    "Evaluation",
+    "check_episodes",
+    "compare",
+    "interval_text",
+    "random_behaviour",
+    "score_text",
+]
 
 _RESAMPLES = 2000
 
@@ -42,6 +49,9 @@ class Evaluation:
             pairs (TaSIL, section 2). Chaotic systems drift apart whatever the student does.
         expert_returns: (E,) return of each episode.
         student_returns: (E,) return of each episode, in the same order.
+        expert_physics_resets: Episodes of the expert in which the simulator put itself back.
+        physics_resets: The same for the student; where they are more than half, the returns mean
+            nothing and there is no normalised one.
     """
 
     episodes: int
@@ -57,6 +67,8 @@ class Evaluation:
     imitation_gap: float
     expert_returns: tuple[float, ...]
     student_returns: tuple[float, ...]
+    expert_physics_resets: int = 0
+    physics_resets: int = 0
 
     def to_json(self) -> dict[str, Any]:
         """Return the evaluation as plain JSON values."""
@@ -117,6 +129,9 @@ def compare(
             FdtasilWarning,
             stacklevel=2,
         )
+    reset = student_episodes.physics_resets > 0
+    if reset.mean() > 0.5:  # more than one start each: not the returns of this policy
+        meaningful = False
     visited = student_episodes.observations[student_episodes.valid]
     own = student_episodes.actions[student_episodes.valid]
     distance = np.linalg.norm(own - expert.ask(visited, "evaluate"), axis=1)
@@ -134,7 +149,37 @@ def compare(
         imitation_gap=_imitation_gap(student_episodes, expert_episodes),
         expert_returns=tuple(theirs.tolist()),
         student_returns=tuple(ours.tolist()),
+        expert_physics_resets=int((expert_episodes.physics_resets > 0).sum()),
+        physics_resets=int(reset.sum()),
     )
+
+
+def check_episodes(episodes: Episodes, name: str) -> None:
+    """Refuse an expert's episodes that nothing can be learnt from or judged by.
+
+    Args:
+        episodes: (E, T) the expert's.
+        name: Of the environment.
+
+    Raises:
+        EnvironmentFault: If all end at their first step though T is longer (a single one may
+            fall by chance), or the simulator put itself back in more than half of them.
+    """
+    count, horizon = episodes.valid.shape
+    if count > 1 and horizon > 1 and episodes.lengths.max() == 1:
+        raise EnvironmentFault(
+            f"{name}: all {count} episodes of the expert ended at their first step",
+            f"episodes of up to {horizon} steps",
+            "check the environment's end, or pass horizon=1 if one step is all there is",
+        )
+    unstable = int((episodes.physics_resets > 0).sum())
+    if unstable > count / 2:
+        raise EnvironmentFault(
+            f"{name}: the simulation became unstable and reset itself in {unstable} of "
+            f"{count} episodes of the expert",
+            "physics that last, in at least half of them",
+            "check the model's time step and the expert's actions",
+        )
 
 
 def random_behaviour(pool: EnvironmentPool) -> Behaviour:
@@ -200,7 +245,7 @@ def _interval(ours: np.ndarray, theirs: np.ndarray, seed: int) -> tuple[float, f
 
 def _imitation_gap(student: Episodes, expert: Episodes) -> float:
     both = student.valid & expert.valid
-    deviation = expert.observations[expert.valid].std(axis=0)
+    deviation = expert.observations[expert.valid].std(axis=0, dtype=np.float64)
     live = deviation > 1e-6
     if not live.any():
         return 0.0

@@ -7,7 +7,7 @@ import safetensors.torch
 import torch
 from torch import Tensor, nn
 
-from fdtasil.errors import StorageError
+from fdtasil.errors import FitError, StorageError
 
 __all__ = ["FitState"]
 
@@ -41,8 +41,39 @@ class FitState:
         self.step += 1
         self._recent.append(losses)
 
+    def check_finite(self, held_out: float | None = None) -> None:
+        """Refuse to go on from, or to keep, what is not finite: it never becomes so again.
+
+        Args:
+            held_out: The held-out loss, where there is one.
+
+        Raises:
+            FitError: Naming the first step with such a loss, if the losses show it.
+        """
+        bad = [not torch.isfinite(losses).all() for losses in self._recent]
+        if any(bad):
+            first = bad.index(True)
+            step, loss = self.step - len(bad) + first + 1, float(self._recent[first][0])
+            found = f"the loss became {loss} at step {step}"
+        elif not all(torch.isfinite(weights).all() for weights in self._student.parameters()):
+            found = f"the student's weights are not finite after step {self.step}"
+        elif held_out is not None and not math.isfinite(held_out):
+            found = f"the loss of the held-out episodes became {held_out} at step {self.step}"
+        else:
+            return
+        raise FitError(
+            found,
+            "finite numbers",
+            "lower learning_rate, or check the expert's answers for outliers",
+        )
+
     def log(self, held_out: float | None) -> dict[str, float]:
-        """Make an entry of the steps since the last one, and keep the weights if they are best."""
+        """Make an entry of the steps since the last one, and keep the weights if they are best.
+
+        Raises:
+            FitError: If losses or weights are not finite.
+        """
+        self.check_finite(held_out)
         means = torch.stack(self._recent).mean(dim=0).tolist()
         self._recent = []
         entry: dict[str, float] = {"step": self.step, **dict(zip(_TERMS, means, strict=True))}
@@ -61,7 +92,12 @@ class FitState:
             self._student.load_state_dict(self._best)
 
     def to_bytes(self) -> bytes:
-        """Return the state as a safetensors file."""
+        """Return the state as a safetensors file.
+
+        Raises:
+            FitError: If losses or weights are not finite: an earlier file is worth more.
+        """
+        self.check_finite()
         groups = {
             "student": self._student.state_dict(),
             "best": self._best,

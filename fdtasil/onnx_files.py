@@ -185,6 +185,12 @@ def export_module(
     onnx.helper.set_model_props(model, dict(metadata))
     session = open_session(model, "the export")
     answers = run_session(session, "actions", example.numpy())
+    if not all(torch.isfinite(weights).all() for weights in module.parameters()):
+        raise ExportError(  # an infinite one may hide behind a tanh
+            f"{type(module).__name__} has weights that are not finite",
+            "finite numbers",
+            "train it again: it did not learn what it answers",
+        )
     difference = float(np.abs(answers - expected).max())
     if not difference <= 1e-5 * max(1.0, float(np.abs(expected).max())):  # catches NaN as well
         raise ExportError(

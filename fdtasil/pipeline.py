@@ -11,7 +11,7 @@ from fdtasil.configuration import GATE_STATES, Configuration, check_count
 from fdtasil.datasets import DatasetLike, load_dataset
 from fdtasil.distilled import Distilled
 from fdtasil.environments import EnvironmentLike, EnvironmentPool, resolve_horizon
-from fdtasil.evaluation import Evaluation, compare
+from fdtasil.evaluation import Evaluation, check_episodes, compare
 from fdtasil.events import Callback, Event, tell_all
 from fdtasil.experts import Expert, ExpertLike, check_expert, load_expert
 from fdtasil.interrupts import Interrupts
@@ -347,6 +347,7 @@ def _gate(
     with stages.stage("expert", len(starts) * horizon, "step") as move:
         behaviour = follow(expert.policy("evaluate"))
         episodes = rollout(behaviour, pool, starts, horizon, on_step=move)
+    check_episodes(episodes, pool.name)
     visited = episodes.observations[episodes.valid]
     spread = np.linspace(0, len(visited) - 1, GATE_STATES).astype(int)
     check_expert(expert, visited[spread], pool.boxes, force=force)

@@ -1,5 +1,6 @@
 """Policies in environments; the only file that steps an environment."""
 
+import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -7,8 +8,8 @@ from typing import NamedTuple
 import gymnasium
 import numpy as np
 
-from fdtasil.environments import EnvironmentPool
-from fdtasil.errors import EnvironmentFault
+from fdtasil.environments import EnvironmentPool, simulator_warnings
+from fdtasil.errors import EnvironmentFault, FdtasilWarning
 
 __all__ = [
     "Behaviour",
@@ -64,7 +65,8 @@ class Episodes:
         terminated: (E,) bool, true where the environment ended the episode (a fall), false where
             time did.
         clipped_actions: Steps at which an action had to be clipped.
-        physics_resets: Steps at which the simulator silently put itself back to its start.
+        physics_resets: (E,) number of steps of each episode at which the simulator silently put
+            itself back to its start.
     """
 
     observations: np.ndarray
@@ -76,7 +78,7 @@ class Episodes:
     seeds: np.ndarray
     terminated: np.ndarray
     clipped_actions: int
-    physics_resets: int
+    physics_resets: np.ndarray
 
     @property
     def lengths(self) -> np.ndarray:
@@ -115,46 +117,49 @@ def rollout(
     Raises:
         EnvironmentFault: If the environment raises, or observations are not finite.
     """
-    record = _Record(len(seeds), horizon, pool)
+    record = _Record(seeds, horizon, pool)
     generators = list(noise) if noise is not None else [np.random.default_rng(s) for s in seeds]
     members = pool.take(min(len(seeds), _SLOTS))
-    for first in range(0, len(seeds), len(members)):
-        chunk = range(first, min(first + len(members), len(seeds)))
-        environments = dict(zip(chunk, members, strict=False))
-        alive = list(chunk)
-        batch = _observed([_reset(environments[e], int(seeds[e]), pool) for e in alive], pool)
-        for step in range(horizon):
-            decision = behaviour(batch, [generators[e] for e in alive])
-            allowed = record.decide(alive, step, batch, decision)
-            after, going = [], np.ones(len(alive), bool)
-            for row, episode in enumerate(alive):
-                observation, reward, terminated, truncated = _step(
-                    environments[episode], allowed[row], record, pool
-                )
-                record.rewards[episode, step] = reward
-                record.terminated[episode] = terminated
-                after.append(observation)
-                going[row] = not (terminated or truncated)
-            on_step(len(alive))
-            batch = _observed(after, pool)[going]
-            alive = [episode for row, episode in enumerate(alive) if going[row]]
-            if not alive:
-                break
-    return record.episodes(seeds)
+    with simulator_warnings():
+        for first in range(0, len(seeds), len(members)):
+            chunk = range(first, min(first + len(members), len(seeds)))
+            environments = dict(zip(chunk, members, strict=False))
+            alive = list(chunk)
+            first_ones = [record.reset(environments[e], e) for e in alive]
+            batch = record.observed(first_ones, alive, None)
+            for step in range(horizon):
+                decision = behaviour(batch, [generators[e] for e in alive])
+                allowed = record.decide(alive, step, batch, decision)
+                after, going = [], np.ones(len(alive), bool)
+                for row, episode in enumerate(alive):
+                    observation, going[row] = record.step(
+                        environments[episode], allowed[row], episode, step
+                    )
+                    after.append(observation)
+                on_step(len(alive))
+                record.check_rewards(alive, step)
+                batch = record.observed(after, alive, step)[going]
+                alive = [episode for row, episode in enumerate(alive) if going[row]]
+                if not alive:
+                    break
+    return record.episodes()
 
 
 def first_observations(pool: EnvironmentPool, seeds: Sequence[int]) -> np.ndarray:
     """Return the (E, n) float32 observations that episodes of these seeds start from."""
     (environment,) = pool.take(1)
-    return _observed([_reset(environment, int(seed), pool) for seed in seeds], pool)
+    record, numbers = _Record(seeds, 0, pool), range(len(seeds))
+    with simulator_warnings():
+        return record.observed([record.reset(environment, e) for e in numbers], numbers, None)
 
 
 class _Record:
     """The arrays of `Episodes` while they are being filled."""
 
-    def __init__(self, episodes: int, horizon: int, pool: EnvironmentPool) -> None:
+    def __init__(self, seeds: Sequence[int], horizon: int, pool: EnvironmentPool) -> None:
         n, m = pool.boxes.observation_size, pool.boxes.action_size
-        self._low, self._high = pool.boxes.low, pool.boxes.high
+        self._low, self._high, self._name = pool.boxes.low, pool.boxes.high, pool.name
+        self._seeds, episodes = [int(seed) for seed in seeds], len(seeds)
         self.observations = np.zeros((episodes, horizon, n), np.float32)
         self.actions = np.zeros((episodes, horizon, m), np.float32)
         self.expert_actions = np.zeros((episodes, horizon, m), np.float32)
@@ -162,13 +167,90 @@ class _Record:
         self.rewards = np.zeros((episodes, horizon))
         self.valid = np.zeros((episodes, horizon), bool)
         self.terminated = np.zeros(episodes, bool)
-        self.clipped_actions = self.physics_resets = 0
+        self.physics_resets = np.zeros(episodes, np.int64)
+        self.clipped_actions = 0
+
+    def reset(self, environment: gymnasium.Env, episode: int) -> np.ndarray:
+        """Return the first observation of an episode."""
+        try:
+            observation, _ = environment.reset(seed=self._seeds[episode])
+        except Exception as error:
+            raise self._crash(episode, None, "reset()", error) from error
+        return observation
+
+    def step(
+        self, environment: gymnasium.Env, action: np.ndarray, episode: int, step: int
+    ) -> tuple[np.ndarray, bool]:
+        """Record a step's outcome; return the observation and whether the episode goes on."""
+        data = getattr(environment.unwrapped, "data", None)
+        before = _clock(data)
+        try:
+            answer = environment.step(action)
+        except Exception as error:
+            raise self._crash(episode, step, "step()", error) from error
+        try:
+            observation, reward, terminated, truncated, _ = answer
+            self.rewards[episode, step] = float(reward)
+            self.terminated[episode] = bool(terminated)
+            going = not (terminated or truncated)
+        except (TypeError, ValueError) as error:
+            raise self._fault(
+                episode,
+                step,
+                f"step() returned {_described(answer)}",
+                "(observation, reward, terminated, truncated, info), the reward one number",
+            ) from error
+        # MuJoCo resets an unstable simulation inside step() and says so only by its clock, and
+        # where the clock had not come far by its warnings.
+        now = _clock(data)
+        if now < before or ((now == before or step == 0) and _unstable(data)):
+            self.physics_resets[episode] += 1
+        return observation, going
+
+    def check_rewards(self, alive: Sequence[int], step: int) -> None:
+        """Raise where a reward is not finite: it would make every mean so."""
+        rewards = self.rewards[alive, step]
+        if not np.isfinite(rewards).all():
+            row = int((~np.isfinite(rewards)).argmax())
+            raise self._fault(alive[row], step, f"the reward is {rewards[row]}", "a finite number")
+
+    def observed(
+        self, observations: Sequence[np.ndarray], alive: Sequence[int], step: int | None
+    ) -> np.ndarray:
+        """Return observations as one float32 array; looked at together, for it is quicker so.
+
+        Args:
+            observations: One for each of the episodes `alive`.
+            alive: Numbers of the episodes.
+            step: That they were returned by, or None for the reset.
+        """
+        size = self.observations.shape[2]
+        try:
+            batch = np.array(observations)
+        except ValueError:  # of several lengths
+            batch = np.empty(0)
+        if batch.shape == (len(alive), size) and batch.dtype.kind in "fiu":
+            batch = batch.astype(np.float32, copy=False)
+            if np.isfinite(batch).all():
+                return batch
+        for episode, observation in zip(alive, observations, strict=True):
+            problem = _problem(observation, size)
+            if problem is not None:
+                raise self._fault(episode, step, problem, f"{size} finite numbers, as promised")
+        raise AssertionError("good observations make a good batch")
 
     def decide(
         self, alive: list[int], step: int, observations: np.ndarray, decision: Decision
     ) -> np.ndarray:
         """Record a step's decision; return its actions within the bounds."""
         expected = (len(alive), self.actions.shape[2])
+        if decision.action.shape == expected and not np.isfinite(decision.action).all():
+            row = int((~np.isfinite(decision.action).all(axis=1)).argmax())
+            raise EnvironmentFault(
+                f"{self._place(alive[row], step)}: the policy's action is not finite",
+                f"{expected[1]} finite numbers",
+                "check the policy's weights, and its answer to the observations of that episode",
+            )
         if decision.action.shape != expected:
             raise EnvironmentFault(
                 f"a policy answered with actions of shape {decision.action.shape}",
@@ -185,7 +267,16 @@ class _Record:
         self.clipped_actions += int((allowed != decision.action).any(axis=1).sum())
         return allowed
 
-    def episodes(self, seeds: Sequence[int]) -> Episodes:
+    def episodes(self) -> Episodes:
+        """Return what was recorded; warn of physics that reset themselves."""
+        unstable = np.count_nonzero(self.physics_resets)
+        if unstable:
+            warnings.warn(
+                f"{self._name}: the simulation became unstable and reset itself in {unstable} of "
+                f"{len(self._seeds)} episodes; their returns are of more than one start",
+                FdtasilWarning,
+                stacklevel=3,
+            )
         return Episodes(
             self.observations,
             self.actions,
@@ -193,56 +284,73 @@ class _Record:
             self.answered,
             self.rewards,
             self.valid,
-            np.asarray(seeds, np.int64),
+            np.asarray(self._seeds, np.int64),
             self.terminated,
             self.clipped_actions,
             self.physics_resets,
         )
 
+    def _place(self, episode: int, step: int | None) -> str:
+        when = "" if step is None else f", step {step}"
+        return f"{self._name}, episode {episode} (seed {self._seeds[episode]}){when}"
 
-def _reset(environment: gymnasium.Env, seed: int, pool: EnvironmentPool) -> np.ndarray:
-    try:
-        observation, _ = environment.reset(seed=seed)
-    except Exception as error:
-        raise _crash(pool, f"reset(seed={seed})", error) from error
-    return observation
+    def _fault(
+        self, episode: int, step: int | None, problem: str, expected: str
+    ) -> EnvironmentFault:
+        return EnvironmentFault(
+            f"{self._place(episode, step)}: {problem}",
+            expected,
+            "mend the environment, or end the episode before it diverges",
+        )
 
-
-def _step(
-    environment: gymnasium.Env, action: np.ndarray, record: _Record, pool: EnvironmentPool
-) -> tuple[np.ndarray, float, bool, bool]:
-    # MuJoCo resets an unstable simulation inside step() and says so only by its clock.
-    data = getattr(environment.unwrapped, "data", None)
-    before = getattr(data, "time", None)
-    try:
-        observation, reward, terminated, truncated, _ = environment.step(action)
-    except Exception as error:
-        raise _crash(pool, "step()", error) from error
-    if before is not None and getattr(data, "time", before) < before:
-        record.physics_resets += 1
-    return observation, float(reward), bool(terminated), bool(truncated)
-
-
-def _observed(observations: Sequence[np.ndarray], pool: EnvironmentPool) -> np.ndarray:
-    """Return observations as one float32 array; looked at together, for it is quicker so."""
-    expected = (pool.boxes.observation_size,)
-    if all(np.shape(row) == expected for row in observations):
-        batch = np.array(observations, np.float32)
-        if np.isfinite(batch).all():
-            return batch
-    rows = [np.asarray(row, np.float32) for row in observations]
-    bad = next(row for row in rows if row.shape != expected or not np.isfinite(row).all())
-    raise EnvironmentFault(
-        f"{pool.name} returned an observation of shape {bad.shape}, "
-        f"{np.count_nonzero(~np.isfinite(bad))} of its values not finite",
-        f"{expected[0]} finite numbers",
-        "mend the environment, or end the episode before it diverges",
-    )
+    def _crash(
+        self, episode: int, step: int | None, call: str, error: Exception
+    ) -> EnvironmentFault:
+        first_line = (str(error).splitlines() or [""])[0][:200]
+        return EnvironmentFault(
+            f"{self._place(episode, step)}: {call} raised {type(error).__name__}: {first_line}",
+            "an environment that runs without raising",
+            "run it on its own from that seed, and mend it",
+        )
 
 
-def _crash(pool: EnvironmentPool, call: str, error: Exception) -> EnvironmentFault:
-    return EnvironmentFault(
-        f"{pool.name}: {call} raised {type(error).__name__}: {error}",
-        "an environment that runs without raising",
-        "run it on its own with random actions, and mend it",
+def _clock(data: object) -> float:
+    """Return the time of a MuJoCo simulation; 0 where there is none."""
+    time = getattr(data, "time", 0.0)
+    return time if isinstance(time, float) else 0.0
+
+
+def _unstable(data: object) -> bool:
+    """Return whether MuJoCo has found a simulation unstable since the episode began."""
+    numbers = getattr(getattr(data, "warning", None), "number", None)
+    if numbers is None:
+        return False
+    import mujoco  # whoever has such data has loaded it
+
+    kinds = (f"mjWARN_BAD{what}" for what in ("QPOS", "QVEL", "QACC"))
+    return any(numbers[int(vars(mujoco)["mjtWarning"].__members__[kind])] for kind in kinds)
+
+
+def _described(answer: object) -> str:
+    if not isinstance(answer, tuple):
+        return f"a {type(answer).__name__}"
+    if len(answer) != 5:
+        return f"{len(answer)} things"
+    return f"reward={answer[1]!r}, terminated={answer[2]!r}, truncated={answer[3]!r}"[:200]
+
+
+def _problem(observation: object, size: int) -> str | None:
+    """Return what is wrong with an observation, or None."""
+    values = np.asarray(observation)
+    if values.dtype.kind not in "fiu":
+        return f"the observation is a {type(observation).__name__} of {values.dtype}"
+    if values.shape != (size,):
+        return f"the observation has shape {values.shape}"
+    bad = ~np.isfinite(values.astype(np.float32))
+    if not bad.any():
+        return None
+    first = int(bad.argmax())
+    return (
+        f"{bad.sum()} of the observation's {size} values are not finite in float32, "
+        f"the first is value {first}: {values[first]}"
     )

@@ -2,6 +2,7 @@
 
 import json
 import time
+import warnings
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
@@ -21,7 +22,8 @@ from fdtasil.demonstrations import (
     statistics,
 )
 from fdtasil.environments import EnvironmentPool
-from fdtasil.errors import SettingError
+from fdtasil.errors import FdtasilWarning, SettingError
+from fdtasil.evaluation import check_episodes
 from fdtasil.events import Callback, Event
 from fdtasil.experts import Expert
 from fdtasil.fit import Hooks, fit
@@ -144,10 +146,12 @@ class Rounds:
         behaviour = trainer.behaviour(Situation(round_, expert, policy, record_extra))
         first = self.episodes
         recorded = self._record(pool, behaviour, "rollout", first, count)
+        if round_ == 0:  # every trainer's expert acts alone there
+            check_episodes(recorded, pool.name)
         new = label(recorded, expert, first, round_)
         self.episodes += count
         self.counts["clipped_actions"] += recorded.clipped_actions
-        self.counts["physics_resets"] += recorded.physics_resets
+        self.counts["physics_resets"] += int(recorded.physics_resets.sum())
         self.counts["terminated_episodes"] += int(recorded.terminated.sum())
         bounds = pool.boxes.low, pool.boxes.high
         before, old = self.dataset, None
@@ -223,6 +227,14 @@ class Rounds:
         """Train a fresh student on all demonstrations, as it sees them."""
         run, view, data = self.run, self.view, self.data
         seen = view.demonstrations(data.demonstrations)
+        complete = run.trainer is None or self.episodes == run.episodes
+        if complete and run.fit.validation > 0 and len(np.unique(seen.episode)) == 1:
+            warnings.warn(
+                f"validation={run.fit.validation:g} of a single episode: none is held out, and "
+                "the last weights are kept",
+                FdtasilWarning,
+                stacklevel=2,
+            )
         scales = statistics(seen.observations)
         shape = StudentShape(view.size, seen.actions.shape[1], run.hidden, run.activation)
         start = torch_generator(run.seed, "student", round_)

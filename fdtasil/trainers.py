@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from numbers import Real
 from typing import Literal, Protocol
 
 import numpy as np
@@ -241,7 +242,7 @@ def _check_updates(updates: Sequence[int]) -> None:
 
 
 def _check_share(share: float) -> float:
-    if not 0 <= share <= 1:
+    if not isinstance(share, Real) or not 0 <= share <= 1:
         raise SettingError(f"beta gives {share!r}", "a share from 0 to 1", "write beta=0.5")
     return share
 

@@ -55,6 +55,7 @@ def test_nothing_is_asked_where_nothing_is_to_be_found(probes):
     assert result.report["calibration"] is None
 
 
+@pytest.mark.fault(87)
 def test_a_radius_in_the_noise_is_warned_of_with_the_reason():
     with pytest.warns(
         FdtasilWarning, match=r"radius=0.005: .* is noise; the calibration suggests"
@@ -64,6 +65,7 @@ def test_a_radius_in_the_noise_is_warned_of_with_the_reason():
     assert any("radius=0.005" in text for text in result.report["warnings"])
 
 
+@pytest.mark.fault(88)
 def test_a_radius_across_the_kinks_is_warned_of():
     def kinked(x):
         return np.abs(np.sin(4 * x @ GAIN.T)) / 2

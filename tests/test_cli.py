@@ -88,7 +88,9 @@ def test_inspect_distill_evaluate(tmp_path):
         (["distill", "EXPERT", "Pendulum-v1"], 1, "wants 5 observations"),
         (["distill", "EXPERT", "NoSuch-v0"], 1, "can't be made"),
         (["inspect", "EXPERT", "CartPole-v1"], 1, "actions Discrete"),
-        (["distill", "EXPERT", TOY, "--prbes", "3"], 2, "--probes"),
+        pytest.param(
+            ["distill", "EXPERT", TOY, "--prbes", "3"], 2, "--probes", marks=pytest.mark.fault(107)
+        ),
         (["distil"], 2, "distill"),
     ],
 )

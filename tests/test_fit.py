@@ -12,7 +12,7 @@ from fdtasil.compute import pick_device, torch_settings
 from fdtasil.demonstrations import Answers, Demonstrations, ask_probes, statistics
 from fdtasil.errors import FdtasilWarning, FitError, SettingError
 from fdtasil.experts import load_expert
-from fdtasil.fit import fit
+from fdtasil.fit import Hooks, fit
 from fdtasil.presets import PRESETS
 from fdtasil.probes import Probes
 from fdtasil.seeding import torch_generator
@@ -132,18 +132,54 @@ def test_the_expert_is_asked_as_often_as_predicted(spec, pools):
     assert probes.pools(6, visits) == pools
 
 
-def test_fewer_states_than_a_batch():
-    demonstrations, _, _ = linear_task(states=7)
+@pytest.mark.fault(95, 97, 98)
+@pytest.mark.parametrize(("states", "batches"), [(1, [1]), (7, [7]), (101, [51, 50])])
+def test_few_states_and_a_state_left_over(states, batches):
+    demonstrations, _, _ = linear_task(states=states)
     settings = replace(STANDARD.fit, steps=5)
     history = fit(new_student(), demonstrations, None, None, settings, stream)
     assert history[-1]["step"] == 5
+    assert np.isfinite(list(history[-1].values())).all()
+    dealt = Batches(demonstrations, None, None, stream, torch.device("cpu"))
+    every = dealt.epoch(0, torch.arange(states), settings.steps_an_epoch(states))
+    assert [len(batch.observations) for batch in every] == batches
 
 
+@pytest.mark.fault(100)
 def test_a_loss_that_is_not_finite_stops_the_training():
     demonstrations, _, _ = linear_task()
     demonstrations.actions[3, 0] = np.nan
-    with pytest.raises(FitError, match="the loss became nan"):
+    with pytest.raises(FitError, match=r"the loss became nan at step [12]\n"):
         fit(new_student(), demonstrations, None, None, STANDARD.fit, stream)
+
+
+@pytest.mark.fault(100)
+def test_a_state_that_is_not_finite_is_never_handed_on():
+    """One NaN label: its epoch spoils all weights, long before the history has an entry."""
+    demonstrations, _, _ = linear_task()
+    demonstrations.actions[3, 0] = np.nan
+    kept = []
+    hooks = Hooks(checkpoint=lambda state: kept.append(state.to_bytes()))
+    with pytest.raises(FitError, match="at step") as error:
+        fit(new_student(), demonstrations, None, None, STANDARD.fit, stream, hooks=hooks)
+    assert kept == []
+    assert len(str(error.value).splitlines()) <= 6
+
+
+@pytest.mark.fault(100)
+def test_weights_that_overflow_in_the_last_step_are_found():
+    """Its loss, of the weights before, is finite."""
+    with pytest.raises(FitError, match="weights are not finite after step 1"):
+        train(steps=1, learning_rate=1e38)
+    with pytest.raises(FitError, match="the loss became"):
+        train(steps=300, learning_rate=1e38)
+
+
+@pytest.mark.fault(97)
+def test_one_state_has_raw_scales():
+    scales = statistics(np.float32([[3, 0, -1e6]]))
+    assert scales.deviation.tolist() == scales.scale.tolist() == [1, 1, 1]
+    assert scales.live.all()
 
 
 def test_equal_seeds_give_equal_weights():
@@ -191,14 +227,25 @@ def test_torch_settings_are_put_back():
         torch.set_float32_matmul_precision("highest")
 
 
-@pytest.mark.parametrize("device", ["gpu", "mps", "cuda"])
+@pytest.mark.fault(105)
+@pytest.mark.parametrize("device", ["gpu", "mps", "cuda", "", None])
 def test_a_device_that_is_not_there_is_refused(device):
     if device == "cuda" and torch.cuda.is_available():
         pytest.skip("this machine has a GPU")
-    with pytest.raises(SettingError, match=f"device='{device}'"):
+    with pytest.raises(SettingError, match=f"device={device!r}"):
         pick_device(device)
 
 
+@pytest.mark.fault(105)
+def test_a_gpu_beyond_the_last_one_is_refused(monkeypatch):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
+    monkeypatch.setattr("torch.cuda.device_count", lambda: 1)
+    assert pick_device("cuda").type == "cuda"
+    with pytest.raises(SettingError, match=r"device='cuda:1', and this torch sees 1 GPU"):
+        pick_device("cuda:1")
+
+
+@pytest.mark.fault(91)
 def test_answers_that_take_much_memory_are_announced_before_they_are_asked(monkeypatch):
     monkeypatch.setattr("fdtasil.demonstrations._MUCH", 1000)
     _, _, ask = linear_task(states=50, spec="5")

@@ -127,6 +127,7 @@ def test_a_predict_without_options_is_a_predict():
     assert load_expert(Regressor(), 5, 2).ask(rows, "act").shape == (16, 2)
 
 
+@pytest.mark.fault(62)
 def test_an_expert_worse_than_chance_has_no_share():
     def idle(observations):
         return np.zeros((len(observations), 1))

@@ -9,7 +9,7 @@ import torch
 from conftest import QUICK, TOY
 
 import fdtasil
-from fdtasil.errors import SettingError, StorageError
+from fdtasil.errors import FdtasilWarning, SettingError, StorageError
 from fdtasil.fitstate import FitState
 
 
@@ -44,10 +44,27 @@ def test_patience_stops_early(linear):
         fdtasil.distill(linear, TOY, 0, **QUICK, patience=2)
 
 
-def test_a_single_episode_holds_none_out(linear):
-    result = fdtasil.distill(linear, TOY, 2, **{**QUICK, "episodes": 1}, validation=0.3)
+@pytest.mark.fault(96)
+def test_a_single_episode_holds_none_out_and_says_so(linear):
+    said = r"validation=0\.3 of a single episode: none is held out"
+    with pytest.warns(FdtasilWarning, match=said):
+        result = fdtasil.distill(linear, TOY, 2, **{**QUICK, "episodes": 1}, validation=0.3)
     entry = result.history[-1]
     assert entry["validation_loss"] == entry["loss"]
+    assert len(result.report["warnings"]) == 1
+    with pytest.warns(FdtasilWarning, match=said):
+        fdtasil.distill(demonstrations=result.dataset, validation=0.3, steps=5, hidden=4)
+
+
+@pytest.mark.fault(96)
+def test_a_first_round_of_one_episode_is_no_news(linear):
+    """The last round has more of them, and holds some out."""
+    run = {**QUICK, "episodes": 3, "validation": 0.3}
+    result = fdtasil.distill(linear, TOY, 0, trainer="dagger", **run)
+    assert result.report["warnings"] == []
+    first, last = result.history
+    assert first["validation_loss"] == first["loss"]
+    assert last["validation_loss"] != last["loss"]
 
 
 def test_gradient_clipping_bounds_the_step(linear):

@@ -8,7 +8,7 @@ from gymnasium.spaces import Box
 from toy_environments import Integrator
 
 from fdtasil.environments import EnvironmentPool, resolve_horizon
-from fdtasil.errors import EnvironmentFault, SettingError
+from fdtasil.errors import EnvironmentFault, FdtasilWarning, SettingError
 from fdtasil.rollouts import Decision, follow, rollout
 
 WALLED = "toy_environments:toy/Walled-v0"
@@ -23,6 +23,7 @@ def run(environment, seeds, horizon=30, behaviour=None):
         return rollout(behaviour or follow(still), pool, seeds, horizon)
 
 
+@pytest.mark.fault(69)
 def test_shapes_masks_and_ends():
     episodes = run(WALLED, range(8))
     assert episodes.observations.shape == (8, 30, 5)
@@ -74,6 +75,7 @@ def test_actions_are_clipped_for_the_environment_only():
     assert episodes.clipped_actions == episodes.valid.sum()
 
 
+@pytest.mark.fault(68)
 def test_the_time_limit_is_the_default_horizon():
     with EnvironmentPool(TOY) as pool:
         assert resolve_horizon(None, pool) == 40
@@ -108,7 +110,7 @@ def _raise(step, observation):
     ("how", "found"),
     [
         (_raise, r"step\(\) raised ValueError: boom"),
-        (lambda step, x: x * np.nan if step == 3 else x, "5 of its values not finite"),
+        (lambda step, x: x * np.nan if step == 3 else x, "5 of the observation's 5 values"),
         (lambda step, x: x[:4], r"shape \(4,\)"),
     ],
 )
@@ -137,6 +139,7 @@ def test_an_environment_that_can_not_be_used_is_described(environment, found):
         EnvironmentPool(environment)
 
 
+@pytest.mark.fault(76)
 def test_a_silent_physics_reset_is_counted():
     class Data:
         time = 0.0
@@ -150,4 +153,13 @@ def test_a_silent_physics_reset_is_counted():
             self.data.time = 0.0 if self.data.time > 0.45 else self.data.time + 0.1
             return super().step(action)
 
-    assert run(Jumps, [0], horizon=12).physics_resets == 2
+    with pytest.warns(FdtasilWarning, match="reset itself in 1 of 1 episodes"):
+        assert run(Jumps, [0], horizon=12).physics_resets.tolist() == [2]
+
+
+def test_other_data_than_a_simulators_is_left_alone():
+    class Trades(Integrator):
+        class data:
+            time = np.arange(3)
+
+    assert run(Trades, [0], horizon=3).physics_resets.tolist() == [0]

@@ -77,6 +77,7 @@ def test_other_bytes_are_no_demonstrations(data):
         Dataset.from_bytes(data)
 
 
+@pytest.mark.fault(83)
 def test_streams_are_found_by_name():
     assert generator(0, "a", 1).random() == generator(0, "a", 1).random()
     values = [
@@ -88,12 +89,14 @@ def test_streams_are_found_by_name():
     assert all(type(seed) is int for seed in episode_seeds(0, "e", 0, 3))
 
 
+@pytest.mark.fault(82)
 @pytest.mark.parametrize("seed", [-1, 2**32, 1.0, True, None, "0"])
 def test_a_wrong_seed_is_refused(seed):
     with pytest.raises(SettingError, match="seed="):
         generator(seed, "a")
 
 
+@pytest.mark.fault(82)
 def test_a_numpy_integer_is_a_seed(linear):
     first = fdtasil.distill(linear, TOY, 1, **QUICK, seed=np.int64(3))
     assert type(first.settings["seed"]) is int

@@ -100,12 +100,45 @@ def test_other_bytes_are_no_student(data):
         Student.from_bytes(data)
 
 
-def test_nan_weights_are_not_exported(rows):
+@pytest.mark.fault(101)
+@pytest.mark.parametrize("value", [torch.nan, torch.inf, -torch.inf])
+@pytest.mark.parametrize("layer", [0, -1])
+def test_weights_that_are_not_finite_are_not_exported(value, layer, rows):
+    """Infinite ones may answer with finite actions, for a tanh comes after them."""
     student = make()
     with torch.no_grad():
-        next(student.parameters())[0, 0] = torch.nan
-    with pytest.raises(ExportError, match="differ by nan"):
+        list(student.parameters())[layer].view(-1)[0] = value
+    with pytest.raises(ExportError, match="Student has weights that are not finite"):
         export_module(student, rows, {})
+
+
+@pytest.mark.fault(101)
+def test_an_answer_that_is_not_finite_is_not_exported(rows):
+    class Logarithm(torch.nn.Module):
+        def forward(self, x):
+            """Of negative numbers too."""
+            return torch.log(x)
+
+    with pytest.raises(ExportError, match="differ by nan"):
+        export_module(Logarithm(), rows, {})
+
+
+@pytest.mark.fault(102)
+def test_an_export_is_of_the_module_in_evaluation_mode_which_is_put_back(rows):
+    with torch.random.fork_rng():
+        layers = torch.nn.Linear(3, 8), torch.nn.BatchNorm1d(8), torch.nn.Dropout(0.5)
+        module = torch.nn.Sequential(*layers, torch.nn.Linear(8, 2))
+    module.train()
+    data = export_module(module, rows, {})
+    assert module.training
+    assert all(layer.training for layer in module)
+    assert "Dropout" not in {node.op_type for node in onnx.load_model_from_string(data).graph.node}
+    (answers,) = onnxruntime.InferenceSession(data).run(None, {"obs": rows})
+    with torch.no_grad():
+        assert np.abs(answers - module.eval()(torch.from_numpy(rows)).numpy()).max() <= 1e-5
+    module.eval()
+    assert export_module(module, rows, {}) == data
+    assert not module.training
 
 
 def test_a_module_that_onnx_can_not_hold_is_named(rows):

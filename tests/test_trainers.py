@@ -106,9 +106,39 @@ def test_darts_alpha_is_the_noise_of_an_episode():
     assert 20 * np.trace(noise.T @ noise / len(noise)) == pytest.approx(4.0, rel=0.15)
 
 
+@pytest.mark.fault(103)
 def test_a_perfect_student_makes_no_noise():
     decision, _ = decide(Dart(alpha=1.0), 1, linear)
     assert np.allclose(decision.action, linear(ROWS), atol=1e-6)
+
+
+@pytest.mark.fault(103)
+@pytest.mark.parametrize("alpha", [0.0, 4.0])
+def test_noise_of_a_single_state_is_finite(alpha):
+    """Its covariance has one direction only, and no root by Cholesky."""
+    with EnvironmentPool(TOY) as pool:
+        expert = load_expert(linear, 5, 2)
+
+        def record(behaviour, count):
+            return rollout(behaviour, pool, [0], 1)
+
+        situation = Situation(1, expert, off_by(np.array([0.3, -0.1])), record)
+        act = Dart(alpha=alpha, extra=1).behaviour(situation)
+        noise = [np.random.default_rng(e) for e in range(len(ROWS))]
+        apart = act(ROWS, noise).action - linear(ROWS)
+    assert np.isfinite(apart).all()
+    assert np.abs(apart @ [0.1, 0.3]).max() < 1e-6
+    assert apart.std() > 0.05
+
+
+@pytest.mark.fault(104)
+@pytest.mark.parametrize("beta", [1.5, -0.1, np.nan, np.inf, "half", None, 1j])
+def test_a_mixture_that_is_no_share_is_refused(beta):
+    with pytest.raises(SettingError, match=r"beta gives .*\n.*a share from 0 to 1"):
+        DAgger(beta=beta)
+    run = {**QUICK, "episodes": 3, "trainer": DAgger(beta=lambda i: beta)}
+    with pytest.raises(SettingError, match="beta gives"):
+        fdtasil.distill(linear, TOY, 0, **run)
 
 
 @pytest.mark.parametrize(

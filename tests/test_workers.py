@@ -358,6 +358,7 @@ def script(tmp_path):
         process.communicate()
 
 
+@pytest.mark.fault(79)
 def test_a_killed_parent_leaves_no_worker(script):
     stuck = "ctypes.PyDLL(None).sleep(100)"  # in C, without letting another thread run
     busy = "time.sleep(100)"
@@ -369,6 +370,7 @@ def test_a_killed_parent_leaves_no_worker(script):
     assert gone(pids)
 
 
+@pytest.mark.fault(79)
 def test_an_end_leaves_no_worker(script):
     process, pids = script()
     assert process.communicate(timeout=20) == (None, "")
@@ -377,6 +379,7 @@ def test_an_end_leaves_no_worker(script):
     assert gone(pids)
 
 
+@pytest.mark.fault(80)
 def test_ctrl_c_shows_one_traceback_and_leaves_no_worker(script):
     process, pids = script("time.sleep(100)")
     os.killpg(process.pid, signal.SIGINT)

@@ -125,7 +125,7 @@ class Probes:
         parts += [self.stencil.name] if self.stencil not in (None, EXACT) else []
         parts += ["resample"] if self.resample else []
         parts += [self.space] if self.space else []
-        parts += [f"radius={self.radius:g}"] if self.radius is not None else []
+        parts += [f"radius={_shortest(self.radius)}"] if self.radius is not None else []
         parts += [f"per_step={self.per_step}"] if self.per_step is not None else []
         return ",".join(parts)
 
@@ -174,6 +174,12 @@ class Probes:
     def used_per_visit(self, count: int) -> int:
         """Return how many of a state's `count` probes one visit uses."""
         return count if self.per_step == "all" else min(self.per_step or 1, count)
+
+
+def _shortest(number: float) -> str:
+    """Return the shortest text that reads back as the same number."""
+    text = f"{number:g}"
+    return text if float(text) == number else repr(float(number))
 
 
 _GRAMMAR = 'a number of probes, or a text like "sphere:10,resample", "basis,central", "jacobian"'
