@@ -3,6 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
+from benchmarks.comparison import differences_table, draw_panels, scores_of, scores_table
 from benchmarks.controllers import available
 from benchmarks.distillation import distil_cell
 from benchmarks.runner import Benchmark, Cell, Row
@@ -80,8 +81,29 @@ def run(cell: Cell) -> dict[str, Any]:
     )
 
 
+# The appendix's claims, and the rival: ours - theirs on equal seeds.
+PAIRS = (("1", "jacobian"), ("10", "jacobian"), ("10", "1"), ("50", "1"), ("10", "augmentation"))
+LABELS = {
+    "plain": "plain cloning",
+    "jacobian": "analytic Jacobian",
+    "1": "1 probe",
+    "augmentation": "10 answers as labels",
+}
+
+
 def draw(rows: Sequence[Row]) -> dict[str, bytes]:
-    raise NotImplementedError
+    """One picture and two tables a preset, of the budgets that are complete."""
+    files, text = {}, ""
+    for preset, methods in METHODS.items():
+        mine = [row for row in rows if row["cell"]["preset"] == preset]
+        scores = scores_of(mine, list(methods), len(SEEDS))
+        if not scores:
+            continue
+        picture = draw_panels(scores, list(methods), lambda m: LABELS.get(m, f"{m} probes"))
+        files[f"finite_difference_{preset}.png"] = picture
+        text += f"## Preset `{preset}`\n\n{scores_table(scores, list(methods))}\n"
+        text += f"Differences on equal seeds:\n\n{differences_table(scores, PAIRS)}\n"
+    return files | {"finite_difference.md": text.strip().encode() + b"\n"}
 
 
 FINITE_DIFFERENCE = Benchmark("finite_difference", __doc__ or "", cells, run, draw)
