@@ -10,6 +10,7 @@ import fdtasil
 # From the top of the house to its cellar; a room may import only what stands below it.
 ORDER = [
     "cli",
+    "testing",
     "pipeline",
     "subject",
     "distilled",

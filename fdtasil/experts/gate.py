@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fdtasil.environments import Boxes
-from fdtasil.errors import ExpertError, FdtasilWarning
+from fdtasil.errors import ExpertError, FdtasilError, FdtasilWarning
 from fdtasil.experts.expert import Expert
 
 __all__ = ["Finding", "check_expert", "examine_expert"]
@@ -29,7 +29,7 @@ class Finding:
 
     name: str
     measured: str
-    problem: ExpertError | None
+    problem: FdtasilError | None
 
 
 def examine_expert(expert: Expert, observations: np.ndarray, boxes: Boxes) -> list[Finding]:

@@ -1,0 +1,69 @@
+"""The checks that users run on experts and students of their own."""
+
+import numpy as np
+import pytest
+import torch
+from conftest import GAIN, TOY
+from test_gate import FAULTS
+
+from fdtasil.errors import ExpertError
+from fdtasil.testing import check_expert, check_student
+
+NAMES = ["opening", "answers", "determinism", "batch independence", "action bounds"]
+NAMES += ["action scale", "batch sizes"]
+
+
+def problems(findings):
+    return {finding.name: str(finding.problem) for finding in findings if finding.problem}
+
+
+def test_a_good_expert_passes_every_check(linear):
+    findings = check_expert(linear, TOY)
+    assert [finding.name for finding in findings] == [*NAMES, "return"]
+    assert problems(findings) == {}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+@pytest.mark.filterwarnings("ignore:invalid value")
+def test_every_fault_has_its_name(fault):
+    expert, found = FAULTS[fault]
+    said = problems(check_expert(expert, TOY))
+    with pytest.raises(ExpertError, match=found.replace("16", r"\d+")):
+        raise ExpertError(*next(iter(said.values())).split("\n")[:3])
+
+
+@pytest.mark.fault(52)
+def test_a_function_of_single_rows_is_found_by_as_many_rows_as_coordinates():
+    def single(row):
+        return (GAIN @ row).T if row.shape == (5, 5) else row @ GAIN.T
+
+    assert list(problems(check_expert(single, TOY))) == ["batch sizes"]
+
+
+@pytest.mark.fault(62)
+def test_an_expert_of_another_task_is_no_better_than_chance():
+    def wrong(rows):
+        return np.sign(rows[:, :2]).astype(np.float32)
+
+    assert list(problems(check_expert(wrong, TOY))) == ["return"]
+
+
+def test_what_is_no_expert_does_not_open(tmp_path):
+    assert list(problems(check_expert(tmp_path / "nothing.onnx", TOY))) == ["opening"]
+    assert list(problems(check_student(tmp_path / "nothing.onnx", TOY))) == ["opening"]
+
+
+def test_a_student_passes_every_check(quick, tmp_path):
+    findings = check_student(quick.student, TOY)
+    assert [finding.name for finding in findings] == [*NAMES, "far states", "export"]
+    assert problems(findings) == {}
+    exported = check_student(quick.to_onnx(tmp_path / "s.onnx"), TOY)
+    assert [finding.name for finding in exported] == [*NAMES, "far states"]
+    assert problems(exported) == {}
+
+
+def test_a_student_without_bounds_is_found_far_out():
+    layer = torch.nn.utils.skip_init(torch.nn.Linear, 5, 2, bias=False)
+    with torch.no_grad():
+        layer.weight.copy_(torch.from_numpy(GAIN))
+    assert list(problems(check_student(layer, TOY))) == ["far states"]
