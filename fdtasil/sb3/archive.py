@@ -11,10 +11,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from fdtasil.errors import ExpertError
+from fdtasil.errors import ExpertError, first_line
 from fdtasil.storage import sha256
 
-__all__ = ["Archive", "first_line", "read_archive", "read_file", "shown"]
+__all__ = ["Archive", "read_archive", "read_file"]
 
 _FILE_LIMIT = 256 * 2**20
 # A few kilobytes of zip can unpack to gigabytes, so the sizes are looked at before unpacking.
@@ -117,20 +117,6 @@ def read_file(path: Path) -> bytes:
             f"a file (relative paths start at {Path.cwd()})",
             "check the path",
         ) from error
-
-
-def first_line(error: Exception) -> str:
-    """Return the start of an error's message, for a message of ours."""
-    return shown((str(error).strip().splitlines() or [type(error).__name__])[0])
-
-
-def shown(text: object) -> str:
-    """Return text from a file as one short printable line, for a message of ours.
-
-    A file may hold line breaks, megabytes, and the control characters of a terminal.
-    """
-    line = "".join(character if character.isprintable() else "?" for character in str(text)[:201])
-    return line if len(line) <= 200 else f"{line[:197]}..."
 
 
 def _member(path: Path, content: bytes, name: str) -> bytes:
