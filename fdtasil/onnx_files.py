@@ -70,15 +70,15 @@ def read_model(path: Path) -> "tuple[onnx.ModelProto, str]":
     for magic, (found, next_step) in _IMPOSTORS.items():
         if data.startswith(magic):
             raise ExpertError(f"{path} is {found}", "an ONNX model", next_step)
+    model = None
     try:
         model = onnx.load_model_from_string(data)
         data += load_side_files(model, path, _SIZE_LIMIT - len(data))
-        whole = bool(model.graph.node)
     except ExpertError:
         raise
     except Exception:  # damaged bytes may raise anything
-        whole = False
-    if not whole:
+        model = None
+    if model is None or not model.graph.node:
         raise ExpertError(
             f"{path} is no whole ONNX model ({len(data):,} bytes)",
             "a file written by an ONNX exporter",
@@ -113,8 +113,12 @@ def open_session(model: "onnx.ModelProto", name: str) -> "onnxruntime.InferenceS
     options.log_severity_level = 4
     limit_memory(options)
     try:
+        # Falling back to the one provider that there is prints a banner to standard output.
         return onnxruntime.InferenceSession(
-            model.SerializeToString(), options, providers=["CPUExecutionProvider"]
+            model.SerializeToString(),
+            options,
+            providers=["CPUExecutionProvider"],
+            enable_fallback=0,
         )
     except Exception as error:
         raise _cannot_run(model, name, error) from error

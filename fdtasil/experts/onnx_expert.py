@@ -54,10 +54,13 @@ def open_onnx(
     except ExpertError:
         raise
     except Exception as error:  # onnxruntime has its own, and damaged names are no text
+        limited = isinstance(error, (MemoryError, TimeoutError))
         raise ExpertError(
             f"{path} can't be asked: {first_line(error)}",
-            "answers to two observations of zeros",
-            "export it again, and ask it with onnxruntime alone",
+            "answers to a few observations",
+            "leave the file alone; if you know it, wrap a session of its own in a function"
+            if limited
+            else "export it again, and ask it with onnxruntime alone",
         ) from error
     return Expert(answer, path.name, n, m, digest, twin)
 

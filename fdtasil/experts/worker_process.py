@@ -55,13 +55,14 @@ def as_array(answer: Any) -> Any:
     """
     import numpy as np
 
+    found = answer
     if isinstance(answer, tuple) and len(answer) == 2 and np.ndim(answer[0]) == 2:
         if answer[1] is not None:
             raise TypeError("it returned a second value beside the actions, such as a state")
-        answer = answer[0]
-    if hasattr(answer, "detach"):  # torch is not imported where the expert does not need it
-        answer = answer.detach().cpu().float().numpy()
-    found = np.asarray(answer)
+        found = answer[0]
+    if hasattr(found, "detach"):  # torch is not imported where the expert does not need it
+        found = found.detach().cpu().float().numpy()
+    found = np.asarray(found)
     if found.dtype.kind == "c":
         raise TypeError("it returned complex numbers")
     return np.array(found, dtype=np.float32, order="C")
