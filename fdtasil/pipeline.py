@@ -361,8 +361,8 @@ def _announce(seconds: float, rows: int) -> None:
     if seconds * rows > _LONG:
         warnings.warn(
             f"the expert takes {1000 * seconds:.3g} ms a row, so the {rows:,} rows that this run "
-            f"may ask take up to {seconds * rows / 3600:.1f} h: lower probes, episodes, horizon or "
-            "evaluation_episodes, or let load_expert(..., workers=) answer side by side",
+            f"may ask take up to {seconds * rows / 3600:.1f} h: lower probes, episodes, horizon "
+            "or evaluation_episodes, or let load_expert(..., workers=) answer side by side",
             FdtasilWarning,
             stacklevel=5,
         )

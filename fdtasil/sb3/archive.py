@@ -143,11 +143,17 @@ def _member(path: Path, content: bytes, name: str) -> bytes:
 
 def _check_inner_size(path: Path, data: bytes) -> None:
     """Refuse a `policy.pth`, which is a zip again, that unpacks to too much."""
+    if not data.startswith(b"PK\x03\x04"):  # torch's own test for it
+        return  # before 1.6 it was no zip, and not compressed
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as inner:
             size = sum(info.file_size for info in inner.infolist())
-    except zipfile.BadZipFile:  # the format of torch before 1.6 is no zip and not compressed
-        return
+    except Exception as error:  # damaged or hostile bytes may raise anything
+        raise ExpertError(
+            f"{path}: policy.pth can't be read: {first_line(error)}",
+            "a whole zip, as torch.save() writes it",
+            _AGAIN,
+        ) from error
     _check_size(path, "policy.pth", size)
 
 
