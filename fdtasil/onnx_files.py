@@ -277,7 +277,7 @@ def _cannot_run(model: "onnx.ModelProto", name: str, error: Exception) -> Expert
     try:
         needed = ", ".join(f"{x.domain or 'opset'} {x.version}" for x in model.opset_import)
         foreign = sorted(_foreign_operators(model))
-    except ValueError:  # names that are no text
+    except (TypeError, ValueError):  # names that are no text come as bytes, or not at all
         needed, foreign = "unreadable", []
     if foreign:
         return ExpertError(
