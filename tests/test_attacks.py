@@ -6,6 +6,7 @@ What each promise of SECURITY.md is held by stands there.
 import io
 import json
 import pickle
+import re
 import sys
 import zipfile
 from contextlib import suppress
@@ -20,7 +21,7 @@ from onnx import helper
 from sb3_agents import Marker, booby_trap, make_agent, rewrite, save_agent
 
 import fdtasil
-from fdtasil.errors import FdtasilError, SettingError
+from fdtasil.errors import ExpertError, FdtasilError, SettingError
 from fdtasil.student import Student
 
 
@@ -195,3 +196,26 @@ def test_a_file_can_not_ask_for_an_import_or_for_trust(changes, found, tmp_path,
     with pytest.raises(SettingError, match=found):
         _remembered(tmp_path)
     assert not Path("marker").exists()
+
+
+def test_every_promise_names_tests_that_exist():
+    tests = Path(__file__).parent
+    text = (tests.parent / "SECURITY.md").read_text()
+    sources = "".join(path.read_text() for path in tests.glob("test_*.py"))
+    named = set(re.findall(r"`(test_\w+)`", text))
+    assert len(named) > 20
+    assert not {name for name in named if f"def {name}(" not in sources}
+    for promise in text.partition("## Promised")[2].partition("## Not promised")[0].split("\n\n"):
+        assert not promise.strip() or "`test_" in promise
+
+
+def test_a_student_with_hostile_metadata(tmp_path):
+    model = onnx.load(mlp_onnx(tmp_path / "e.onnx"))
+    for columns in ("0,x", "\x1b[2J", ""):
+        helper.set_model_props(model, {"fdtasil.observation_columns": columns})
+        onnx.save(model, tmp_path / "e.onnx")
+        with pytest.raises(ExpertError, match="it sees the columns") as caught:
+            fdtasil.evaluate(
+                tmp_path / "e.onnx", lambda x: x[:, :2] / 9, TOY, episodes=1, horizon=5
+            )
+        assert str(caught.value).replace("\n", "").isprintable()
