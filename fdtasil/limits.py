@@ -1,8 +1,8 @@
 """What an ONNX model may take: memory, and seconds for a call.
 
 A file of 200 bytes can ask for terabytes, or for a loop without an end. The limits are far from
-what controllers need, and cost a microsecond a call: onnxruntime's own allocator keeps the first,
-and one thread that looks at the running calls now and then the second.
+what controllers need, and cost a few microseconds a call: onnxruntime's own allocator keeps the
+first, and one thread that looks at the running calls now and then the second.
 """
 
 import threading

@@ -107,20 +107,15 @@ class Expert:
 
     def _rows(self, observations: np.ndarray) -> np.ndarray:
         """Return observations as (B, n) float32 in this machine's order of bytes."""
-        if isinstance(observations, torch.Tensor):
-            observations = observations.detach().cpu().numpy()
+        plain = type(observations) is np.ndarray and observations.dtype == np.float32
         try:
-            if np.ma.is_masked(observations):
-                raise ValueError("some of them are masked")
-            given = np.asarray(observations)
-            if given.dtype.kind not in "biufO":
-                raise ValueError(f"numpy takes them for {given.dtype}")
-            with np.errstate(over="ignore"):  # what is infinite then is refused below
-                rows = np.ascontiguousarray(given, np.float32)
-            if given.ndim != 2 or self.observation_size not in (None, rows.shape[1]):
-                raise ValueError(f"their shape is {given.shape}")
-            if not np.isfinite(rows).all():
-                row, column = np.argwhere(~np.isfinite(rows))[0]
+            # What rollouts and probes ask is float32 already, and asked often.
+            rows = np.ascontiguousarray(observations) if plain else _converted(observations)
+            if np.ndim(observations) != 2 or self.observation_size not in (None, rows.shape[1]):
+                raise ValueError(f"their shape is {np.shape(observations)}")
+            finite = np.isfinite(rows)
+            if not finite.all():
+                row, column = np.argwhere(~finite)[0]
                 raise ValueError(f"row {row} has {rows[row, column]} in column {column}")
         except (TypeError, ValueError) as error:
             raise SettingError(
@@ -164,3 +159,16 @@ class Expert:
 
     def _has_action_size(self, answer: np.ndarray) -> bool:
         return self.action_size is None or answer.shape[1] == self.action_size
+
+
+def _converted(observations: object) -> np.ndarray:
+    """Return numbers of any type as float32, in an array of one axis at least."""
+    if isinstance(observations, torch.Tensor):
+        observations = observations.detach().cpu().numpy()
+    if np.ma.is_masked(observations):
+        raise ValueError("some of them are masked")
+    given = np.asarray(observations)
+    if given.dtype.kind not in "biufO":
+        raise ValueError(f"numpy takes them for {given.dtype}")
+    with np.errstate(over="ignore"):  # what is infinite then is refused
+        return np.ascontiguousarray(given, np.float32)
