@@ -86,7 +86,8 @@ def _outside(message: Any) -> Iterator["onnx.TensorProto"]:
 
 
 def _entries(tensor: "onnx.TensorProto") -> dict[str, str]:
-    return {entry.key: entry.value for entry in tensor.external_data}
+    # Damaged text, which is not UTF-8, comes as bytes.
+    return {str(entry.key): str(entry.value) for entry in tensor.external_data}
 
 
 def _read(folder: Path, name: str, room: int) -> bytes:

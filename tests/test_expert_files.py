@@ -20,6 +20,7 @@ from sb3_agents import make_agent, save_agent
 import fdtasil
 from fdtasil import limits
 from fdtasil.errors import ExpertError, SettingError
+from fdtasil.experts import twin
 
 
 @pytest.fixture
@@ -473,6 +474,20 @@ def test_a_small_file_that_unpacks_to_gigabytes(model, tmp_path):
 def test_a_model_within_the_memory_is_asked(tmp_path, rows):
     path = bomb(tmp_path / "e.onnx", sum_of_many(10**6))
     assert fdtasil.load_expert(path, 5, 2).ask(rows, "act").shape == (7, 2)
+
+
+@pytest.mark.fault(21)
+def test_a_twin_is_not_built_of_what_is_large(tmp_path, monkeypatch):
+    """What onnxruntime can do within its limits, torch would keep all at once."""
+    nodes = [helper.make_node("Concat", ["obs"] * 2, ["d0"], axis=1)]
+    nodes += [helper.make_node("Concat", [f"d{k}"] * 2, [f"d{k + 1}"], axis=1) for k in range(12)]
+    nodes.append(helper.make_node("Slice", ["d12", "zero", "two", "one", "one"], ["z"]))
+    numbers = {"zero": [0], "one": [1], "two": [2]}
+    path = bomb(tmp_path / "e.onnx", graph(nodes, *numbers.items()))
+    assert fdtasil.load_expert(path, 5, 2).module is not None
+    monkeypatch.setattr(twin, "_LARGEST", 10**6)  # 64 rows of 40,960 numbers are more
+    assert fdtasil.load_expert(path, 5, 2).module is None
+    assert fdtasil.load_expert(mlp_onnx(tmp_path / "mlp.onnx")).module is not None
 
 
 @pytest.fixture

@@ -258,6 +258,17 @@ def test_a_graph_without_a_twin_says_so(tmp_path, rows):
         ask_probes(expert, rows, probes, statistics(rows), np.random.default_rng(0))
 
 
+def test_what_the_actions_do_not_depend_on_is_no_part_of_the_twin(tmp_path, rows):
+    path = mlp_onnx(tmp_path / "e.onnx", extra_outputs={"value": 1})
+    model = onnx.load(path)
+    (value,) = (node for node in model.graph.node if "value" in node.output)
+    value.op_type = "Softsign"  # no operator of a twin
+    onnx.save(model, path)
+    expert = load_expert(path, 5, 2)
+    found = expert.module(torch.from_numpy(rows)).numpy()
+    assert np.allclose(found, expert.ask(rows, "check"), atol=1e-6)
+
+
 # --- callables that misbehave
 
 

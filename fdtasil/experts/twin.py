@@ -15,7 +15,7 @@ __all__ = ["torch_twin"]
 Operator = Callable[..., Tensor]
 
 _AGREEMENT = 1e-4  # relative to the largest action; float32 networks reach 1e-6
-_LARGEST = 10**6  # numbers for each row; torch has no limit of memory as onnxruntime has
+_LARGEST = 2**27  # numbers in one value of a twin on trial: torch has no limit of memory
 
 
 def torch_twin(
@@ -33,8 +33,8 @@ def torch_twin(
         observation_size: n.
 
     Returns:
-        The twin, float32, or None where the graph has an operator that is not one of an MLP, or
-        the twin does not agree with the session.
+        The twin, float32, or None where the output depends on an operator that is not one of an
+        MLP, or the twin does not agree with the session.
     """
     try:
         twin = _Twin(model, output)
@@ -44,7 +44,7 @@ def torch_twin(
     expected = answer(rows)
     try:
         with torch.no_grad():
-            answers = twin(torch.from_numpy(rows)).numpy()
+            answers = twin.compute(torch.from_numpy(rows), _LARGEST).numpy()
     except Exception:
         return None
     tolerance = _AGREEMENT * max(1.0, float(np.abs(expected).max()))
@@ -77,22 +77,26 @@ class _Twin(torch.nn.Module):
 
     def forward(self, observations: Tensor) -> Tensor:
         """(B, n) float32 -> (B, m) float32."""
+        return self.compute(observations)
+
+    def compute(self, observations: Tensor, largest: int | None = None) -> Tensor:
+        """Do the same, with at most `largest` numbers in a value if that is given."""
         values: dict[str, Any] = {"": None, self._input: observations}
         for name, constant in self._constants.items():
             values[name] = constant.to(observations.device)
         for operator, inputs, output, attributes in self._nodes:
             values[output] = operator(*(values[name] for name in inputs), **attributes)
-            if values[output].numel() > _LARGEST * max(1, len(observations)):
+            if largest is not None and values[output].numel() > largest:
                 raise ValueError(f"{output} is larger than anything in an MLP")
         return values[self._output]
 
 
 def _needed(graph: "onnx.GraphProto", output: str) -> "list[onnx.NodeProto]":
-    """Return the nodes that an output depends on: the session computes no others."""
+    """Return the nodes that an output depends on; value functions and the like are none of it."""
     wanted, found = {output}, []
     for node in reversed(graph.node):
         if wanted & set(node.output):
-            wanted |= set(node.input)
+            wanted |= set(node.input) - {""}
             found.append(node)
     return found[::-1]
 
