@@ -9,6 +9,8 @@ __all__ = [
     "FitError",
     "SettingError",
     "StorageError",
+    "first_line",
+    "shown",
 ]
 
 
@@ -65,3 +67,17 @@ class StorageError(FdtasilError, OSError):
 
 class FdtasilWarning(UserWarning):
     """Something that did not stop the work, and that the result should be read with."""
+
+
+def first_line(error: Exception) -> str:
+    """Return the start of an error's message, for a message of ours."""
+    return shown((str(error).strip().splitlines() or [type(error).__name__])[0])
+
+
+def shown(text: object) -> str:
+    """Return text from a file as one short printable line, for a message of ours.
+
+    A file may hold line breaks, megabytes, and the control characters of a terminal.
+    """
+    line = "".join(character if character.isprintable() else "?" for character in str(text)[:201])
+    return line if len(line) <= 200 else f"{line[:197]}..."

@@ -4,6 +4,7 @@ onnx and onnxruntime are imported inside the functions, so that `import fdtasil`
 """
 
 import logging
+import re
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
@@ -13,7 +14,9 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
-from fdtasil.errors import ExpertError, ExportError
+from fdtasil.errors import ExpertError, ExportError, first_line, shown
+from fdtasil.limits import limit_memory, run_within_limits
+from fdtasil.side_files import load_side_files, names_of_side_files
 from fdtasil.storage import sha256
 
 if TYPE_CHECKING:
@@ -31,7 +34,11 @@ __all__ = [
 ]
 
 _OPSET = 18  # old enough for the runtimes on robots, new enough for torch's exporter
-_SIZE_LIMIT = 256 * 2**20
+_SIZE_LIMIT = (
+    2**30
+)  # bytes, with the side files; a protobuf message can't have more than twice that
+# Whose operators come with onnxruntime; the others are in libraries of native code.
+_DOMAINS = ("ai.onnx", "com.microsoft")
 
 _IMPOSTORS = {
     b"<": ("an HTML or XML page", "download the file itself, not the page about it"),
@@ -47,13 +54,14 @@ _IMPOSTORS = {
 def read_model(path: Path) -> "tuple[onnx.ModelProto, str]":
     """Read an ONNX file with its weights, also where they lie in a side file.
 
-    Nothing outside the model's own folder is read, and no code of the file is run.
+    Nothing outside the model's own folder is read, no link to a side file is followed, and no code
+    of the file is run.
 
     Returns:
         The model, and the sha256 of its file (followed by its side files, where it has any).
 
     Raises:
-        ExpertError: If it is missing, not ONNX, over 256 MiB, or its side file can't be used.
+        ExpertError: If it is missing, not ONNX, over 1 GiB, or a side file of it can't be used.
     """
     import onnx
 
@@ -62,9 +70,13 @@ def read_model(path: Path) -> "tuple[onnx.ModelProto, str]":
     for magic, (found, next_step) in _IMPOSTORS.items():
         if data.startswith(magic):
             raise ExpertError(f"{path} is {found}", "an ONNX model", next_step)
+    model = None
     try:
         model = onnx.load_model_from_string(data)
-    except Exception:
+        data += load_side_files(model, path, _SIZE_LIMIT - len(data))
+    except ExpertError:
+        raise
+    except Exception:  # damaged bytes may raise anything
         model = None
     if model is None or not model.graph.node:
         raise ExpertError(
@@ -72,16 +84,6 @@ def read_model(path: Path) -> "tuple[onnx.ModelProto, str]":
             "a file written by an ONNX exporter",
             "copy or export it again",
         )
-    folder, side_files = path.resolve().parent, sorted(_side_files(model))
-    try:
-        onnx.load_external_data_for_model(model, str(folder))
-        data += b"".join((folder / name).read_bytes() for name in side_files)
-    except Exception as error:
-        raise ExpertError(
-            f"{path} keeps weights in {', '.join(side_files)}: {_first_line(error)}",
-            f"a plain file of that name in {folder}",
-            "copy both files together under their old names, or export with external_data=False",
-        ) from error
     return model, sha256(data)
 
 
@@ -90,7 +92,7 @@ def side_files(data: bytes) -> set[str]:
     import onnx
 
     try:
-        return _side_files(onnx.load_model_from_string(data))
+        return names_of_side_files(onnx.load_model_from_string(data))
     except Exception:  # `read_model` says what they are instead
         return set()
 
@@ -109,28 +111,33 @@ def open_session(model: "onnx.ModelProto", name: str) -> "onnxruntime.InferenceS
     options.add_session_config_entry("session.intra_op.allow_spinning", "0")
     options.enable_mem_pattern = False  # memory grows with every new batch size otherwise
     options.log_severity_level = 4
+    limit_memory(options)
     try:
+        # Falling back to the one provider that there is prints a banner to standard output.
         return onnxruntime.InferenceSession(
-            model.SerializeToString(), options, providers=["CPUExecutionProvider"]
+            model.SerializeToString(),
+            options,
+            providers=["CPUExecutionProvider"],
+            enable_fallback=0,
         )
     except Exception as error:
-        opset = max(entry.version for entry in model.opset_import)
-        raise ExpertError(
-            f"onnxruntime {onnxruntime.__version__} can't run {name}: {_first_line(error)}",
-            "standard operators in a version it knows "
-            f"(this file: opset {opset}, IR {model.ir_version})",
-            "upgrade onnxruntime, or export again with an older opset such as 17",
-        ) from error
+        raise _cannot_run(model, name, error) from error
 
 
 def run_session(
     session: "onnxruntime.InferenceSession", output: str, observations: np.ndarray
 ) -> np.ndarray:
-    """Answer one batch, casting to the type the model wants and back to float32."""
+    """Answer one batch, casting to the type the model wants and back to float32.
+
+    Raises:
+        TimeoutError: If it takes longer than a minute.
+        MemoryError: If it takes more than 4 GiB.
+        Exception: Whatever onnxruntime has.
+    """
     entry = session.get_inputs()[0]
     wanted = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
     batch = observations.astype(wanted.get(entry.type, np.float64), copy=False)
-    return np.asarray(session.run([output], {entry.name: batch})[0]).astype(np.float32, copy=False)
+    return run_within_limits(session, output, {entry.name: batch}).astype(np.float32, copy=False)
 
 
 def is_batched(session: "onnxruntime.InferenceSession") -> bool:
@@ -219,7 +226,7 @@ def _export_graph(module: torch.nn.Module, example: torch.Tensor) -> "onnx.Model
         model = program.model_proto
     except Exception as error:
         raise ExportError(
-            f"torch can't export {type(module).__name__}: {_first_line(error)}",
+            f"torch can't export {type(module).__name__}: {first_line(error)}",
             "a module made of operations that ONNX has",
             "replace the operation named above",
         ) from error
@@ -268,14 +275,44 @@ def _read_bytes(path: Path) -> bytes:
         ) from error
 
 
-def _side_files(model: "onnx.ModelProto") -> set[str]:
+def _cannot_run(model: "onnx.ModelProto", name: str, error: Exception) -> ExpertError:
+    """Say why onnxruntime refuses a model; its own texts begin with signatures of C++."""
+    import onnxruntime
+
+    text, library = str(error), f"onnxruntime {onnxruntime.__version__}"
+    try:
+        needed = ", ".join(f"{x.domain or 'opset'} {x.version}" for x in model.opset_import)
+        foreign = sorted(_foreign_operators(model))
+    except (TypeError, ValueError):  # names that are no text come as bytes, or not at all
+        needed, foreign = "unreadable", []
+    if foreign:
+        return ExpertError(
+            f"{name} has operators of a library: {shown(', '.join(foreign))}",
+            "the operators of ONNX and onnxruntime; libraries of native code are never loaded",
+            "export the controller with these, or wrap it in a function on batches",
+        )
+    known = re.search(r"(?:domain (\S+) is till|max supported) (opset|IR version:) (\d+)", text)
+    if known:
+        what = "IR" if known[1] is None else "opset" if known[1] == "ai.onnx" else known[1]
+        return ExpertError(
+            f"{name} needs {shown(needed)} and IR {model.ir_version}; {library} knows {what} "
+            f"{known[3]} at most",
+            "a file that is not newer than the library",
+            "upgrade onnxruntime, or export again with an older opset such as 17",
+        )
+    return ExpertError(
+        f"{library} can't run {name}: {first_line(error)}",
+        f"standard operators in a version it knows (this file: {shown(needed)}, "
+        f"IR {model.ir_version})",
+        "upgrade onnxruntime, or export again with an older opset such as 17",
+    )
+
+
+def _foreign_operators(model: "onnx.ModelProto") -> set[str]:
+    own = {(function.domain, function.name) for function in model.functions}
     return {
-        entry.value
-        for tensor in model.graph.initializer
-        for entry in tensor.external_data
-        if entry.key == "location"
+        f"{node.domain}::{node.op_type}"
+        for node in model.graph.node
+        if node.domain and not node.domain.startswith(_DOMAINS)
+        if (node.domain, node.op_type) not in own
     }
-
-
-def _first_line(error: Exception) -> str:
-    return (str(error).strip().splitlines() or [type(error).__name__])[0][:200]

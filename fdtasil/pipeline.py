@@ -1,6 +1,7 @@
 """distill(): the whole story, from an expert and an environment to a student."""
 
 import time
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +12,7 @@ from fdtasil.configuration import GATE_STATES, Configuration, check_count
 from fdtasil.datasets import DatasetLike, load_dataset
 from fdtasil.distilled import Distilled
 from fdtasil.environments import EnvironmentLike, EnvironmentPool, resolve_horizon
+from fdtasil.errors import FdtasilWarning
 from fdtasil.evaluation import Evaluation, check_episodes, compare
 from fdtasil.events import Callback, Event, tell_all
 from fdtasil.experts import Expert, ExpertLike, check_expert, load_expert
@@ -33,6 +35,7 @@ from fdtasil.views import StudentObservation, View, columns_of, describe_view
 __all__ = ["distill", "evaluate"]
 
 DEFAULT_PROBES = 10
+_LONG = 600.0  # seconds of questions that are announced
 
 
 def distill(
@@ -301,7 +304,8 @@ def _go(rounds: Rounds, subject: Subject, notes: list[str], *, force: bool) -> D
         theirs = None
         if expert is not None and pool is not None:
             starts = episode_seeds(run.seed, "evaluation", 0, run.evaluation_episodes)
-            theirs = _gate(expert, pool, starts, run.horizon, stages, force=force)
+            rows = sum(run.predicted_queries().values())
+            theirs = _gate(expert, pool, starts, run.horizon, stages, force=force, rows=rows)
         started = time.perf_counter()
         rounds.all()
         seconds, student, evaluation = time.perf_counter() - started, rounds.trained, None
@@ -336,14 +340,17 @@ def _gate(
     stages: Stages,
     *,
     force: bool,
+    rows: int = 0,
 ) -> Episodes:
     """Check the expert on first states, let it act, check it on the states it visited.
+
+    Before it acts it is known how fast it is, and so how long `rows` questions may take.
 
     Returns:
         Its episodes from the evaluation's starts, which the student is compared with later.
     """
     first = first_observations(pool, [starts[e % len(starts)] for e in range(GATE_STATES)])
-    check_expert(expert, first, pool.boxes, force=force)
+    _announce(check_expert(expert, first, pool.boxes, force=force), rows)
     with stages.stage("expert", len(starts) * horizon, "step") as move:
         behaviour = follow(expert.policy("evaluate"))
         episodes = rollout(behaviour, pool, starts, horizon, on_step=move)
@@ -352,6 +359,18 @@ def _gate(
     spread = np.linspace(0, len(visited) - 1, GATE_STATES).astype(int)
     check_expert(expert, visited[spread], pool.boxes, force=force)
     return episodes
+
+
+def _announce(seconds: float, rows: int) -> None:
+    """Warn of questions that take long, before they are asked."""
+    if seconds * rows > _LONG:
+        warnings.warn(
+            f"the expert takes {1000 * seconds:.3g} ms a row, so the {rows:,} rows that this run "
+            f"may ask take up to {seconds * rows / 3600:.1f} h: lower probes, episodes, horizon "
+            "or evaluation_episodes, or let load_expert(..., workers=) answer side by side",
+            FdtasilWarning,
+            stacklevel=5,
+        )
 
 
 def _compare(

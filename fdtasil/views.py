@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from fdtasil.demonstrations import Answers, Demonstrations
-from fdtasil.errors import SettingError
+from fdtasil.errors import ExpertError, SettingError, shown
 from fdtasil.experts.hub import fetch, is_hub_uri
 from fdtasil.onnx_files import read_model
 from fdtasil.rollouts import Policy
@@ -116,7 +116,14 @@ def columns_of(policy: object) -> tuple[int, ...] | None:
     model, _ = read_model(Path(path))
     texts = {entry.key: entry.value for entry in model.metadata_props}
     columns = texts.get(COLUMNS)
-    return None if columns is None else tuple(int(column) for column in columns.split(","))
+    try:
+        return None if columns is None else tuple(int(column) for column in columns.split(","))
+    except (TypeError, ValueError) as error:
+        raise ExpertError(
+            f"{path} says that it sees the columns {shown(columns)}",
+            "numbers with commas between, as fdtasil writes them",
+            "export the student again, or pass student_obs=",
+        ) from error
 
 
 def describe_view(student_obs: StudentObservation | None) -> tuple[int, ...] | str | None:

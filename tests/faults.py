@@ -144,7 +144,6 @@ FAULTS = {
 }
 
 LEFT_OUT = {
-    23: "no test writes two gigabytes; files above 1 GiB are refused by their size",
     106: "needs a GPU",
 }
 """Number -> why no test has it."""

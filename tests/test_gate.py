@@ -30,6 +30,7 @@ FAULTS = {
 }
 
 
+@pytest.mark.fault(38, 40, 41, 52, 59)
 @pytest.mark.parametrize("fault", FAULTS)
 @pytest.mark.filterwarnings("ignore:invalid value")
 def test_every_fault_is_found_before_training(fault, monkeypatch):
@@ -58,6 +59,7 @@ def test_a_good_expert_passes(linear):
     check_expert(load_expert(linear), rows, BOXES)
 
 
+@pytest.mark.fault(39)
 def test_a_missing_action_scale_is_suspected():
     wide = Boxes(5, -2 * np.ones(2, np.float32), 2 * np.ones(2, np.float32))
     rows = np.random.default_rng(0).standard_normal((16, 5)).astype(np.float32)
@@ -65,6 +67,7 @@ def test_a_missing_action_scale_is_suspected():
         check_expert(load_expert(lambda x: np.tanh(9 * x[:, :2])), rows, wide)
 
 
+@pytest.mark.fault(33)
 def test_an_expert_of_another_environment_is_refused_by_its_sizes(tmp_path):
     path = mlp_onnx(tmp_path / "e.onnx", sizes=(7, 8, 2))
     with pytest.raises(ExpertError, match="wants 7 observations, the environment gives 5"):

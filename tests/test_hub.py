@@ -191,6 +191,7 @@ def side_by_side(folder, name, location="model.weights"):
     return {name: model.SerializeToString(), beside: weights, "model.weights.bak": b"no"}
 
 
+@pytest.mark.fault(20)
 @pytest.mark.parametrize("location", ["model.weights", "parts/model.weights"])
 def test_side_files_come_from_the_same_commit(location, hub, tmp_path, rows):
     files = side_by_side(tmp_path, "deep/model.onnx", location)
@@ -208,6 +209,7 @@ def test_side_files_come_from_the_same_commit(location, hub, tmp_path, rows):
     assert not any(path.is_symlink() or path.stat().st_nlink > 1 for path in kept)
 
 
+@pytest.mark.fault(17)
 @pytest.mark.parametrize("location", ["../model.weights", "/etc/hostname", "a/../../../x"])
 def test_a_side_file_outside_the_folder_is_neither_fetched_nor_read(location, hub, tmp_path):
     hub.repositories["org/repo"].commit(side_by_side(tmp_path, "deep/model.onnx", location))
@@ -300,6 +302,7 @@ def test_without_huggingface_hub(surroundings):
     assert 'pip install "fdtasil[hub]"' in text
 
 
+@pytest.mark.fault(9)
 def test_what_arrives_changed_is_not_kept(hub):
     hub.spoilt = True
     assert "arrived with 34 bytes and the hash" in refused(WALKER)

@@ -41,6 +41,8 @@ ORDER = [
     "rollouts",
     "environments",
     "onnx_files",
+    "limits",
+    "side_files",
     "progress",
     "storage",
     "compute",

@@ -96,6 +96,7 @@ def test_what_is_refused(reason, plain):
     assert len(str(caught.value).splitlines()) <= 6
 
 
+@pytest.mark.fault(43, 50)
 def test_real_gsde_and_discrete_agents_are_refused(save):
     with pytest.raises(ExpertError, match="gSDE"):
         read_agent(save(make_agent("SAC", use_sde=True)))
@@ -103,6 +104,7 @@ def test_real_gsde_and_discrete_agents_are_refused(save):
         read_agent(save(make_agent("PPO", "CartPole-v1")))
 
 
+@pytest.mark.fault(46)
 def test_another_algorithm_with_the_settings_of_sac(save):
     for trust in (None, "pickle"):
         with pytest.raises(ExpertError, match=r"no agent of a known algorithm .*CrossQPolicy"):
@@ -175,6 +177,7 @@ def test_bad_weights(reason, plain):
         read_agent(plain)
 
 
+@pytest.mark.fault(51)
 def test_wrong_environment(save, tmp_path):
     source = save(make_agent("PPO"))
     with pytest.raises(ExpertError, match="3 observations and 1 actions"):
@@ -188,6 +191,7 @@ def test_wrong_environment(save, tmp_path):
 # Damaged and hostile files
 
 
+@pytest.mark.fault(47)
 @pytest.mark.parametrize("part", [0.0, 0.3, 0.9, 0.999])
 def test_truncated(part, plain):
     content = plain.read_bytes()

@@ -117,6 +117,7 @@ def touch(folder, names):
         (folder / name).write_bytes(b"")
 
 
+@pytest.mark.fault(48)
 @pytest.mark.parametrize("names", NEIGHBOURS, ids=str)
 def test_statistics_are_not_forgotten(names, plain, tmp_path):
     touch(tmp_path, names)

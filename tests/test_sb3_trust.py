@@ -160,6 +160,7 @@ class Halved(ActorCriticPolicy):
         return actions / 2, state
 
 
+@pytest.mark.fault(50)
 @pytest.mark.parametrize(
     ("policy", "kwargs"),
     [

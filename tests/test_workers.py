@@ -160,6 +160,7 @@ def error_of(expert, rows):
     return str(caught.value)
 
 
+@pytest.mark.fault(57, 59)
 @pytest.mark.parametrize("options", [{"workers": 2}, {"workers": 2, "threads": True}])
 @pytest.mark.parametrize(
     "answer",
@@ -249,6 +250,7 @@ def test_one_failure_does_not_wait_for_the_others(tmp_path, rows):
     assert gone(os.listdir(folder)[:1])
 
 
+@pytest.mark.fault(58)
 def test_what_can_not_be_sent_is_refused_at_once(tmp_path, rows):
     lock = threading.Lock()
     with pytest.raises(ExpertError, match=r"can't be sent .*lock(?s:.*)threads=True"):
@@ -271,6 +273,7 @@ def test_a_module_that_is_only_here_is_named(rows, monkeypatch):
     )
 
 
+@pytest.mark.fault(9)
 def test_a_file_that_changes_is_refused(tmp_path, rows):
     expert = fdtasil.load_expert(mlp_onnx(tmp_path / "e.onnx"), 5, 2, workers=1)
     mlp_onnx(tmp_path / "e.onnx", scale=2.0)

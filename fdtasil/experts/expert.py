@@ -8,7 +8,8 @@ from typing import Literal, Protocol
 import numpy as np
 import torch
 
-from fdtasil.errors import ExpertError
+from fdtasil.errors import ExpertError, SettingError, shown
+from fdtasil.experts.worker_process import as_array
 
 __all__ = ["Answer", "Expert", "Purpose", "RaisedElsewhere"]
 
@@ -81,7 +82,8 @@ class Expert:
         """Answer a batch and count its rows.
 
         Args:
-            observations: (B, n) float32 raw observations; not changed.
+            observations: (B, n) finite raw observations, in any type that numpy takes for
+                numbers; not changed.
             purpose: The entry of the ledger that the rows are counted under.
 
         Returns:
@@ -89,8 +91,9 @@ class Expert:
 
         Raises:
             ExpertError: If the expert raises, or its answer has another shape or is not finite.
+            SettingError: If the observations are not finite numbers, or have another shape.
         """
-        rows = np.ascontiguousarray(observations, np.float32)
+        rows = self._rows(observations)
         self.queries[purpose] += len(rows)
         starts = range(0, max(len(rows), 1), self.chunk)
         chunks = [rows[start : start + self.chunk] for start in starts]
@@ -102,18 +105,39 @@ class Expert:
         """Return the expert as a policy whose rows are counted under `purpose`."""
         return lambda observations: self.ask(observations, purpose)
 
+    def _rows(self, observations: np.ndarray) -> np.ndarray:
+        """Return observations as (B, n) float32 in this machine's order of bytes."""
+        plain = type(observations) is np.ndarray and observations.dtype == np.float32
+        try:
+            # What rollouts and probes ask is float32 already, and asked often.
+            rows = np.ascontiguousarray(observations) if plain else _converted(observations)
+            if np.ndim(observations) != 2 or self.observation_size not in (None, rows.shape[1]):
+                raise ValueError(f"their shape is {np.shape(observations)}")
+            finite = np.isfinite(rows)
+            if not finite.all():
+                row, column = np.argwhere(~finite)[0]
+                raise ValueError(f"row {row} has {rows[row, column]} in column {column}")
+        except (TypeError, ValueError) as error:
+            raise SettingError(
+                f"observations that {self.name} can't be asked about: {error}",
+                f"(B, {self.observation_size or 'n'}) finite numbers",
+                "see where they come from: from the environment, or from your own code",
+            ) from error
+        return rows
+
     def _ask_chunk(self, rows: np.ndarray, ask: Answer) -> np.ndarray:
         expected = f"({len(rows)}, {self.action_size or 'm'}) finite numbers"
         try:
             # Each call gets a copy and its answer is copied: experts that write into their input
             # or return their own buffer would otherwise change what is stored.
-            answer = np.array(ask(rows.copy()), dtype=np.float32, order="C")
+            answer = as_array(ask(rows.copy()))
         except ExpertError:
             raise
         except Exception as error:
             kind = error.kind if isinstance(error, RaisedElsewhere) else type(error).__name__
+            text = shown(" ".join(str(error).split()))
             raise ExpertError(
-                f"{self.name} raised {kind} on {len(rows)} observations: {error}",
+                f"{self.name} raised {kind} on {len(rows)} observations: {text}",
                 expected,
                 "call it on such a batch on its own; experts answer (B, n) with (B, m)",
             ) from error
@@ -135,3 +159,16 @@ class Expert:
 
     def _has_action_size(self, answer: np.ndarray) -> bool:
         return self.action_size is None or answer.shape[1] == self.action_size
+
+
+def _converted(observations: object) -> np.ndarray:
+    """Return numbers of any type as float32, in an array of one axis at least."""
+    if isinstance(observations, torch.Tensor):
+        observations = observations.detach().cpu().numpy()
+    if np.ma.is_masked(observations):
+        raise ValueError("some of them are masked")
+    given = np.asarray(observations)
+    if given.dtype.kind not in "biufO":
+        raise ValueError(f"numpy takes them for {given.dtype}")
+    with np.errstate(over="ignore"):  # what is infinite then is refused
+        return np.ascontiguousarray(given, np.float32)

@@ -14,9 +14,9 @@ from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, TypeGuard, TypeVar
 
-from fdtasil.errors import ExpertError
+from fdtasil.errors import ExpertError, first_line
 from fdtasil.onnx_files import side_files
-from fdtasil.sb3.archive import first_line
+from fdtasil.side_files import stays_inside
 from fdtasil.storage import sha256, write_bytes
 
 if TYPE_CHECKING:
@@ -108,7 +108,7 @@ def fetch(uri: str | Path) -> HubFile:
 
 def _parse(text: str) -> _Place:
     found = _URI.fullmatch(text)
-    if not found or not _is_inside(found["file"]):
+    if not found or not stays_inside(found["file"]):
         raise _malformed(text)
     return _Place(found["repo"], str(PurePosixPath(found["file"])), found["revision"])
 
@@ -119,13 +119,6 @@ def _malformed(text: str) -> ExpertError:
         "hf://org/repo/file or hf://org/repo/file@revision of a model repository",
         "write it like that, as text (a Path drops a slash)",
     )
-
-
-def _is_inside(name: str) -> bool:
-    """Whether a name is readable and stays in the folder that it is relative to, on any system."""
-    path = PurePosixPath(name)
-    clean = name.isprintable() and not set("\\:") & set(name)
-    return bool(path.parts) and clean and not path.is_absolute() and ".." not in path.parts
 
 
 def _check_library() -> None:
@@ -146,7 +139,7 @@ def _declared(path: Path) -> list[str]:
     """
     if path.suffix == ".zip":
         return []
-    return sorted(name for name in side_files(path.read_bytes()) if _is_inside(name))
+    return sorted(name for name in side_files(path.read_bytes()) if stays_inside(name))
 
 
 def _stored(place: _Place) -> Path:

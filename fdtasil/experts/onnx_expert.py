@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fdtasil.errors import ExpertError, FdtasilWarning
+from fdtasil.errors import ExpertError, FdtasilWarning, first_line, shown
 from fdtasil.experts.expert import Expert
 from fdtasil.experts.twin import torch_twin
 from fdtasil.onnx_files import is_batched, open_session, read_model, rebatched, run_session
@@ -22,6 +22,8 @@ if TYPE_CHECKING:
 __all__ = ["open_onnx"]
 
 Answer = Callable[[np.ndarray], np.ndarray]
+
+_FLOATS = ("tensor(float)", "tensor(double)", "tensor(float16)")
 
 
 def open_onnx(
@@ -43,11 +45,23 @@ def open_onnx(
     """
     model, digest = read_model(path)
     session = open_session(model, str(path))
-    n = _observation_size(session, path, observation_size)
-    chosen = _choose_output(session, path, action_size, output)
-    answer = _answer(model, session, chosen, n)
-    m = answer(np.zeros((2, n), np.float32)).shape[-1]
-    twin = torch_twin(model, chosen, answer, n)
+    try:
+        n = _observation_size(session, path, observation_size)
+        chosen = _choose_output(session, path, action_size, output)
+        answer = _answer(model, session, chosen, n)
+        m = answer(np.zeros((2, n), np.float32)).shape[-1]
+        twin = torch_twin(model, chosen, answer, n)
+    except ExpertError:
+        raise
+    except Exception as error:  # onnxruntime has its own, and damaged names are no text
+        limited = isinstance(error, (MemoryError, TimeoutError))
+        raise ExpertError(
+            f"{path} can't be asked: {first_line(error)}",
+            "answers to a few observations",
+            "leave the file alone; if you know it, wrap a session of its own in a function"
+            if limited
+            else "export it again, and ask it with onnxruntime alone",
+        ) from error
     return Expert(answer, path.name, n, m, digest, twin)
 
 
@@ -61,13 +75,13 @@ def _observation_size(session: "Session", path: Path, wanted: int | None) -> int
             "export the policy without its state, or wrap it in a function",
         )
     shape, kind = inputs[0].shape, inputs[0].type
-    if kind not in ("tensor(float)", "tensor(double)", "tensor(float16)") or len(shape) != 2:
+    if kind not in _FLOATS or len(shape) not in (1, 2):
         raise ExpertError(
             f"{path} has the input {described}",
-            "(batch, n) numbers of type float16, float32 or float64",
+            "(batch, n) numbers of type float16, float32 or float64, or (n) of them",
             "export the policy for flat observations",
         )
-    n = shape[1] if isinstance(shape[1], int) else wanted
+    n = shape[-1] if isinstance(shape[-1], int) else wanted
     if n is None:
         raise ExpertError(
             f"{path} leaves its observation size open: {described}",
@@ -94,7 +108,8 @@ def _choose_output(
                 f"{path} has no output {output!r}", f"one of {described}", "choose one of these"
             )
         return output
-    fitting = [entry.name for entry in outputs if _could_be_actions(entry, action_size)]
+    rank = len(session.get_inputs()[0].shape)
+    fitting = [entry.name for entry in outputs if _could_be_actions(entry, rank, action_size)]
     if len(fitting) != 1:
         raise ExpertError(
             f"{path} has {len(fitting)} outputs that could be the actions: {described}",
@@ -106,17 +121,19 @@ def _choose_output(
     return fitting[0]
 
 
-def _could_be_actions(entry: "onnxruntime.NodeArg", action_size: int | None) -> bool:
-    if entry.type not in ("tensor(float)", "tensor(double)", "tensor(float16)"):
+def _could_be_actions(entry: "onnxruntime.NodeArg", rank: int, action_size: int | None) -> bool:
+    if entry.type not in _FLOATS:
         return False
     # An exporter may leave the shape open; then only asking tells.
     if not entry.shape or not isinstance(entry.shape[-1], int):
         return True
-    return len(entry.shape) == 2 and action_size in (None, entry.shape[-1])
+    return len(entry.shape) == rank and action_size in (None, entry.shape[-1])
 
 
 def _answer(model: "onnx.ModelProto", session: "Session", output: str, n: int) -> Answer:
     """Return the fastest way to ask that gives the answers of single rows."""
+    if len(session.get_inputs()[0].shape) == 1:
+        return _slow(lambda rows: _one_by_one(session, output, rows), 1, n)
     if is_batched(session):
         if _takes_batches(session, output, n):
             return lambda rows: run_session(session, output, rows)
@@ -143,10 +160,19 @@ def _answer(model: "onnx.ModelProto", session: "Session", output: str, n: int) -
     return at_once if _agree(at_once, in_turn, n) else _slow(in_turn, size, n)
 
 
+def _one_by_one(session: "Session", output: str, rows: np.ndarray) -> np.ndarray:
+    """Ask a model that takes an observation without a batch dimension."""
+    zeros = np.zeros((1, rows.shape[1]), np.float32)  # for an empty batch, to know the width
+    answers = [run_session(session, output, row) for row in (rows if len(rows) else zeros)]
+    return np.stack(answers)[: len(rows)]
+
+
 def _takes_batches(session: "Session", output: str, n: int) -> bool:
     """Whether a free batch dimension is true: a constant inside the graph may hold another."""
     try:
         answers = run_session(session, output, np.zeros((3, n), np.float32))
+    except (MemoryError, TimeoutError):
+        raise
     except Exception:  # onnxruntime has its own
         return False
     return answers.ndim != 2 or len(answers) == 3
@@ -156,6 +182,8 @@ def _agree(at_once: Answer, in_turn: Answer, n: int) -> bool:
     rows = np.random.default_rng(0).standard_normal((17, n)).astype(np.float32)
     try:
         fast, slow = at_once(rows), in_turn(rows)
+    except (MemoryError, TimeoutError):
+        raise
     except Exception:  # a constant inside the graph still wants the old batch
         return False
     return fast.shape == slow.shape and np.allclose(fast, slow, rtol=1e-4, atol=1e-5)
@@ -179,4 +207,4 @@ def _slow(in_turn: Answer, size: int, n: int) -> Answer:
 
 def _describe(entry: "onnxruntime.NodeArg") -> str:
     kind = entry.type.removeprefix("tensor(").removesuffix(")")
-    return f"{entry.name} {kind} ({', '.join(str(size) for size in entry.shape)})"
+    return shown(f"{entry.name} {kind} ({', '.join(str(size) for size in entry.shape)})")

@@ -17,7 +17,7 @@ import traceback
 from collections.abc import Callable
 from typing import IO, Any
 
-__all__ = ["receive", "send"]
+__all__ = ["as_array", "receive", "send"]
 
 _LENGTH = struct.Struct("<Q")
 _PARENT_DEATH = 1  # PR_SET_PDEATHSIG
@@ -42,6 +42,30 @@ def receive(stream: IO[bytes]) -> bytes:
     if not data:
         raise EOFError
     return data
+
+
+def as_array(answer: Any) -> Any:
+    """Return what an expert answered as a float32 array of its own.
+
+    A torch tensor may have a gradient or lie on a GPU, and actions may come with a None beside
+    them, as from stable-baselines3's `predict`.
+
+    Raises:
+        Exception: What numpy or torch has against it.
+    """
+    import numpy as np
+
+    found = answer
+    if isinstance(answer, tuple) and len(answer) == 2 and np.ndim(answer[0]) == 2:
+        if answer[1] is not None:
+            raise TypeError("it returned a second value beside the actions, such as a state")
+        found = answer[0]
+    if hasattr(found, "detach"):  # torch is not imported where the expert does not need it
+        found = found.detach().cpu().float().numpy()
+    found = np.asarray(found)
+    if found.dtype.kind == "c":
+        raise TypeError("it returned complex numbers")
+    return np.array(found, dtype=np.float32, order="C")
 
 
 def main() -> None:
@@ -81,14 +105,13 @@ def _read(requests: IO[bytes], inbox: "queue.SimpleQueue[bytes]") -> None:
 
 def _serve(inbox: "queue.SimpleQueue[bytes]", replies: IO[bytes]) -> None:
     sys.path[:], parcel = pickle.loads(inbox.get())
-    import numpy as np  # only now is it known where modules lie
-
+    # Only now is it known where modules lie.
     # The parcel is a function that opens the expert; pickle finds cloudpickle by itself.
     outcome, answer = _attempt(lambda: pickle.loads(parcel)())
     send(replies, (outcome, None if outcome == "done" else answer))
     while True:
         rows = pickle.loads(inbox.get())
-        send(replies, _attempt(lambda rows=rows: np.array(answer(rows), np.float32, order="C")))
+        send(replies, _attempt(lambda rows=rows: as_array(answer(rows))))
 
 
 def _attempt(work: Callable[[], Any]) -> tuple[str, Any]:

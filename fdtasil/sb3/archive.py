@@ -11,10 +11,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from fdtasil.errors import ExpertError
+from fdtasil.errors import ExpertError, first_line
 from fdtasil.storage import sha256
 
-__all__ = ["Archive", "first_line", "read_archive", "read_file", "shown"]
+__all__ = ["Archive", "read_archive", "read_file"]
 
 _FILE_LIMIT = 256 * 2**20
 # A few kilobytes of zip can unpack to gigabytes, so the sizes are looked at before unpacking.
@@ -119,20 +119,6 @@ def read_file(path: Path) -> bytes:
         ) from error
 
 
-def first_line(error: Exception) -> str:
-    """Return the start of an error's message, for a message of ours."""
-    return shown((str(error).strip().splitlines() or [type(error).__name__])[0])
-
-
-def shown(text: object) -> str:
-    """Return text from a file as one short printable line, for a message of ours.
-
-    A file may hold line breaks, megabytes, and the control characters of a terminal.
-    """
-    line = "".join(character if character.isprintable() else "?" for character in str(text)[:201])
-    return line if len(line) <= 200 else f"{line[:197]}..."
-
-
 def _member(path: Path, content: bytes, name: str) -> bytes:
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
@@ -157,11 +143,17 @@ def _member(path: Path, content: bytes, name: str) -> bytes:
 
 def _check_inner_size(path: Path, data: bytes) -> None:
     """Refuse a `policy.pth`, which is a zip again, that unpacks to too much."""
+    if not data.startswith(b"PK\x03\x04"):  # torch's own test for it
+        return  # before 1.6 it was no zip, and not compressed
     try:
         with zipfile.ZipFile(io.BytesIO(data)) as inner:
             size = sum(info.file_size for info in inner.infolist())
-    except zipfile.BadZipFile:  # the format of torch before 1.6 is no zip and not compressed
-        return
+    except Exception as error:  # damaged or hostile bytes may raise anything
+        raise ExpertError(
+            f"{path}: policy.pth can't be read: {first_line(error)}",
+            "a whole zip, as torch.save() writes it",
+            _AGAIN,
+        ) from error
     _check_size(path, "policy.pth", size)
 
 

@@ -8,8 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from fdtasil.errors import ExpertError
-from fdtasil.sb3.archive import shown
+from fdtasil.errors import ExpertError, shown
 from fdtasil.sb3.recipes import TRUST, Recipe
 from fdtasil.sb3.spaces import Bounds
 from fdtasil.sb3.statistics import Statistics

@@ -7,8 +7,7 @@ from typing import Any
 
 from torch import nn
 
-from fdtasil.errors import ExpertError
-from fdtasil.sb3.archive import shown
+from fdtasil.errors import ExpertError, shown
 
 __all__ = [
     "TRUST",

@@ -8,8 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from fdtasil.errors import ExpertError, SettingError
-from fdtasil.sb3.archive import shown
+from fdtasil.errors import ExpertError, SettingError, shown
 
 __all__ = ["Bounds", "given_bounds", "read_bounds", "read_size"]
 

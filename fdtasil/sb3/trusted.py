@@ -15,8 +15,8 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from fdtasil.errors import ExpertError
-from fdtasil.sb3.archive import Archive, first_line
+from fdtasil.errors import ExpertError, first_line
+from fdtasil.sb3.archive import Archive
 from fdtasil.sb3.network import Clip, Rescale
 from fdtasil.sb3.recipes import Recipe, has_usual_policy
 from fdtasil.sb3.spaces import Bounds, read_bounds
