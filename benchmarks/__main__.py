@@ -8,7 +8,7 @@ import benchmarks
 from benchmarks.finite_difference import FINITE_DIFFERENCE
 from benchmarks.non_differentiable import NON_DIFFERENTIABLE
 from benchmarks.quality import QUALITY
-from benchmarks.runner import FIGURES, RESULTS, Benchmark, read_rows, results_of, run
+from benchmarks.runner import BACKENDS, FIGURES, RESULTS, Benchmark, read_rows, results_of, run
 from benchmarks.speed import SPEED
 from fdtasil.storage import write_bytes
 
@@ -26,7 +26,7 @@ def main() -> int:
     running.add_argument("name", choices=BENCHMARKS)
     running.add_argument("--quick", action="store_true", help="a smoke run of minutes")
     running.add_argument("--workers", type=int, default=1, help="processes of one thread each")
-    running.add_argument("--backend", choices=("loky", "ray"), default="loky")
+    running.add_argument("--backend", choices=BACKENDS, default="loky")
     running.add_argument("--out", type=Path, default=RESULTS, help="folder of the results files")
     drawing = commands.add_parser("draw", help="draw the figures and tables of a results file")
     drawing.add_argument("name", choices=BENCHMARKS)

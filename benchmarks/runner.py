@@ -7,7 +7,7 @@ import subprocess
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from tqdm import tqdm
 
 from fdtasil.report import versions
 
-__all__ = ["Benchmark", "Cell", "Row", "read_rows", "results_of", "run"]
+__all__ = ["BACKENDS", "Benchmark", "Cell", "Row", "read_rows", "results_of", "run"]
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "results"
@@ -65,7 +65,7 @@ def run(
         cells: Which cells.
         path: The results file, one JSON object a line; made if it is not there.
         workers: Processes at once, one thread each.
-        backend: joblib's: "loky" on this machine, "ray" on a Ray cluster.
+        backend: One of `BACKENDS`.
 
     Returns:
         The rows of those cells that failed now.
@@ -78,8 +78,8 @@ def run(
             file.write("\n")  # a kill cut the last line short: leave it to itself
     failed = []
     about = {"commit": _commit(), "versions": versions()}
-    with path.open("a") as file, _backend(backend):
-        rows = _rows(benchmark, due, 1 if benchmark.alone else workers)
+    with path.open("a") as file:
+        rows = BACKENDS[backend](benchmark, due, 1 if benchmark.alone else workers)
         for row in tqdm(rows, total=len(due), desc=benchmark.name, unit="cell", mininterval=5):
             # The parent alone writes, whole lines at once: a kill loses the cells under way.
             file.write(json.dumps({**row, **about}) + "\n")
@@ -106,11 +106,39 @@ def results_of(rows: Iterable[Row]) -> list[Row]:
     return list({_key(row["cell"]): row for row in rows if "result" in row}.values())
 
 
-def _rows(benchmark: Benchmark, cells: Sequence[Cell], workers: int) -> Iterable[Row]:
+def _on_loky(benchmark: Benchmark, cells: Sequence[Cell], workers: int) -> Iterable[Row]:
     if workers == 1:
         return (_timed(benchmark.run, cell) for cell in cells)
     jobs = (delayed(_timed)(benchmark.run, cell) for cell in cells)
-    return Parallel(n_jobs=workers, return_as="generator_unordered", batch_size=1)(jobs)
+    with parallel_config(backend="loky", inner_max_num_threads=1):
+        return Parallel(n_jobs=workers, return_as="generator_unordered", batch_size=1)(jobs)
+
+
+def _on_ray(benchmark: Benchmark, cells: Sequence[Cell], workers: int) -> Iterator[Row]:
+    """Run each cell as a task of one core; the cluster says how many run at once.
+
+    joblib's Ray backend gives no result before the last one is there: a killed sweep would lose
+    everything.
+    """
+    import ray
+
+    if not ray.is_initialized():
+        # Variables of the environment, not arguments, reach numpy and torch before they load.
+        variables = {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(HERE.parent)}
+        ray.init(runtime_env={"env_vars": variables}, log_to_driver=False)
+    task = ray.remote(num_cpus=1)(_timed)
+    under_way = {task.remote(benchmark.run, cell): cell for cell in cells}
+    while under_way:
+        (ready,), _ = ray.wait(list(under_way), num_returns=1)
+        cell = under_way.pop(ready)
+        try:
+            yield ray.get(ready)
+        except ray.exceptions.RayError as error:  # the worker died, not the cell's own code
+            yield {"cell": dict(cell), "error": str(error), "seconds": 0.0, "machine": "lost"}
+
+
+BACKENDS = {"loky": _on_loky, "ray": _on_ray}
+"""Where cells run: processes of this machine, or a Ray cluster (RAY_ADDRESS, or a local one)."""
 
 
 def _timed(function: Callable[[Cell], dict[str, Any]], cell: Cell) -> Row:
@@ -123,14 +151,6 @@ def _timed(function: Callable[[Cell], dict[str, Any]], cell: Cell) -> Row:
         outcome = {"error": traceback.format_exc(limit=-4)}
     seconds = round(time.perf_counter() - started, 2)
     return {"cell": dict(cell), **outcome, "seconds": seconds, "machine": _machine()}
-
-
-def _backend(name: str) -> Any:
-    if name == "ray":
-        from ray.util.joblib import register_ray
-
-        register_ray()
-    return parallel_config(backend=name, inner_max_num_threads=1 if name == "loky" else None)
 
 
 def _key(cell: Cell) -> str:

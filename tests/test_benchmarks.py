@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+from threadpoolctl import threadpool_info
 
 pytest.importorskip("joblib", reason="needs the extra: pip install 'fdtasil[bench]'")
 
@@ -30,6 +32,7 @@ def doubles(path):
     return {row["cell"]["number"]: row["result"]["double"] for row in results_of(read_rows(path))}
 
 
+@pytest.mark.fault(120)
 @pytest.mark.parametrize("workers", [1, 2])
 def test_a_failed_cell_is_kept_and_does_not_stop_the_others(workers, tmp_path):
     path = tmp_path / "toy.jsonl"
@@ -39,6 +42,41 @@ def test_a_failed_cell_is_kept_and_does_not_stop_the_others(workers, tmp_path):
     assert doubles(path) == {0: 0, 1: 2, 2: 4, 4: 8}
     for row in read_rows(path):
         assert row.keys() >= {"versions", "machine", "seconds", "commit"}
+
+
+def threads(cell):
+    import fdtasil  # noqa: F401  (as a cell's process does)
+    from fdtasil.compute import torch_settings
+
+    with torch_settings(torch.device("cpu")):
+        pass
+    pools = [pool["num_threads"] for pool in threadpool_info()]
+    return {"torch": torch.get_num_threads(), "others": max(pools, default=1)}
+
+
+@pytest.mark.fault(119)
+def test_cells_side_by_side_have_one_thread_each(tmp_path):
+    several = Benchmark("threads", "Counts.", lambda quick: [], threads, lambda rows: {})
+    assert run(several, CELLS[:2], tmp_path / "t.jsonl", workers=2) == []
+    for row in read_rows(tmp_path / "t.jsonl"):
+        assert row["result"] == {"torch": 1, "others": 1}
+
+
+def test_ray_gives_the_same_results(tmp_path):
+    """Three cells on a Ray of this machine."""
+    ray = pytest.importorskip("ray", reason="needs the extra: pip install 'fdtasil[ray]'")
+    ray.init(
+        num_cpus=2,
+        include_dashboard=False,
+        log_to_driver=False,
+        runtime_env={"env_vars": {"PYTHONPATH": f"{ROOT}:{ROOT / 'tests'}"}},
+    )
+    try:
+        run(TOY, CELLS[:3], tmp_path / "ray.jsonl", workers=2, backend="ray")
+    finally:
+        ray.shutdown()
+    run(TOY, CELLS[:3], tmp_path / "here.jsonl")
+    assert doubles(tmp_path / "ray.jsonl") == doubles(tmp_path / "here.jsonl")
 
 
 def test_what_is_done_is_skipped_and_a_cut_line_is_done_again(tmp_path):

@@ -119,6 +119,21 @@ def test_a_worker_computes_on_one_thread_and_loads_what_the_expert_needs(rows):
     assert fdtasil.load_expert(look, workers=1).ask(rows[:1], "act").tolist() == [[1, 0]]
 
 
+@pytest.mark.fault(118)
+def test_processes_are_started_after_torch_used_several_threads(linear, rows):
+    """A fork would copy the locks of threads that it does not have."""
+    import torch
+
+    torch.set_num_threads(2)
+    try:
+        matrix = torch.ones(512, 512)
+        assert float((matrix @ matrix)[0, 0]) == 512
+        answers = fdtasil.load_expert(linear, workers=1, timeout=60).ask(rows, "act")
+    finally:
+        torch.set_num_threads(1)
+    assert np.array_equal(answers, linear(rows))
+
+
 # --- at the same time
 
 
