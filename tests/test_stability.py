@@ -8,7 +8,8 @@ import torch
 
 pytest.importorskip("joblib", reason="needs the extra: pip install 'fdtasil[bench]'")
 
-from benchmarks.stability import NUS, STABILITY, follow_student
+from benchmarks.stability import NUS, SOURCES, STABILITY, follow_student
+from benchmarks.stability_table import breaks_at
 from benchmarks.synthetic_system import SIZE, SyntheticSystem, advance, as_function, make_expert
 from fdtasil import load_expert
 from fdtasil.environments import EnvironmentPool
@@ -92,3 +93,37 @@ def test_a_tiny_cell_runs(order, source):
     assert (result["derivative_error"] > 0) == (order > 0)
     assert (result["curvature_error"] > 0) == (order > 1)
     assert (result["queries"]["probe"] > 0) == (source == "differences")
+
+
+def row(order, source, seed):
+    """A row as a student leaves it whose error doubles below nu = 1 / (order + 1)."""
+    error = np.where(np.array(NUS) < 1 / (order + 1), 0.3, 0.1).tolist()
+    both = {"median": error, "q90": error}
+    base = {"median": 0.1, "q90": 0.1}
+    judged = {"gap": both, "mean": both, "largest": both}
+    judged["on_expert"] = {"mean": base, "largest": base}
+    result = {"nus": list(NUS), "fresh": judged, "learnt": judged}
+    return {
+        "cell": {"order": order, "source": source, "seed": seed},
+        "result": json.loads(json.dumps(result)),
+        "seconds": 1.0,
+    }
+
+
+def test_the_figure_and_the_tables_are_drawn_from_any_part_of_a_sweep():
+    whole = [row(*key, seed) for seed in range(3) for key in SOURCES]
+    for rows in (whole, whole[:1], whole[:7]):
+        drawn = STABILITY.draw(rows)
+        assert drawn["stability.png"].startswith(b"\x89PNG")
+    table = STABILITY.draw(whole)["stability.md"].decode()
+    assert "| 2 | finite differences | 3 | 1/3 |" in table
+    assert "| 1 | fresh | 1 [1, 1] |" in table
+
+
+def test_an_order_breaks_where_its_error_doubles():
+    for order, source in SOURCES:
+        result = row(order, source, 0)["result"]
+        assert breaks_at(result, "fresh", "mean") == pytest.approx(1 / (order + 1), rel=0.2)
+    calm = row(0, "none", 0)["result"]
+    calm["learnt"]["mean"]["median"] = [0.1] * len(NUS)
+    assert breaks_at(calm, "learnt", "mean") == pytest.approx(NUS[0])
