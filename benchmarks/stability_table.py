@@ -22,7 +22,8 @@ _QUANTITIES = {"mean": "mean over time", "largest": "largest over time"}
 
 _GAPS = """\
 Imitation gap at some nu: median over seeds of the median over starts [95 % interval], and the
-median over seeds of the 90 % quantile over starts.
+median over seeds of the 90 % quantile over starts. Seconds: of the whole cell by the clock on the
+wall, whatever else the machine did.
 """
 _BREAKS = """\
 The nu below which a student's error on its own path is more than twice that on the expert's path:
