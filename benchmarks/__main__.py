@@ -10,10 +10,11 @@ from benchmarks.non_differentiable import NON_DIFFERENTIABLE
 from benchmarks.quality import QUALITY
 from benchmarks.runner import BACKENDS, FIGURES, RESULTS, Benchmark, read_rows, results_of, run
 from benchmarks.speed import SPEED
+from benchmarks.stability import STABILITY
 from fdtasil.storage import write_bytes
 
 BENCHMARKS: dict[str, Benchmark] = {
-    b.name: b for b in (FINITE_DIFFERENCE, QUALITY, NON_DIFFERENTIABLE, SPEED)
+    b.name: b for b in (FINITE_DIFFERENCE, QUALITY, NON_DIFFERENTIABLE, STABILITY, SPEED)
 }
 
 

@@ -1,6 +1,7 @@
 """Means that one bad seed does not rule, and how sure they are."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 from scipy import stats
@@ -8,24 +9,31 @@ from scipy import stats
 __all__ = ["interquartile_mean", "interval", "interval_text", "paired_difference"]
 
 _RESAMPLES = 2000
+_trimmed_mean = partial(stats.trim_mean, proportiontocut=0.25)
 
 
 def interquartile_mean(values: Sequence[float]) -> float:
     """Return the mean of the middle half of the values."""
-    return float(stats.trim_mean(values, 0.25))
+    return float(_trimmed_mean(values))
 
 
-def interval(values: Sequence[float]) -> tuple[float, float]:
-    """Return the 95 % bootstrap interval of the interquartile mean over seeds.
+def interval(
+    values: Sequence[float], statistic: Callable[..., np.ndarray] = _trimmed_mean
+) -> tuple[float, float]:
+    """Return the 95 % bootstrap interval of a statistic over seeds.
 
     A single value, or equal ones, give an interval of no width: they say nothing of the spread.
+
+    Args:
+        values: One for each seed.
+        statistic: Takes an array and `axis`; the interquartile mean if none is given.
     """
     sample = np.asarray(values, float)
     if len(sample) < 2 or np.ptp(sample) == 0:
         return float(sample[0]), float(sample[0])
     found = stats.bootstrap(
         (sample,),
-        lambda x, axis: stats.trim_mean(x, 0.25, axis=axis),
+        statistic,
         n_resamples=_RESAMPLES,
         method="percentile",
         rng=np.random.default_rng(0),
