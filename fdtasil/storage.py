@@ -94,6 +94,8 @@ def verify(folder: Path) -> dict[str, bytes]:
         # Nothing but what we write: a manifest that was changed must not pass for a shorter one.
         if to_json(manifest) != listed or not isinstance(manifest, dict):
             raise ValueError(f"{MANIFEST} changed after writing")
+        if any(Path(name).is_absolute() or ".." in Path(name).parts for name in manifest):
+            raise ValueError(f"{MANIFEST} names a file outside of the folder")
         files = {name: _place(folder, name).read_bytes() for name in manifest}
     except (OSError, ValueError) as error:
         raise StorageError(

@@ -192,6 +192,7 @@ def test_the_unit_of_the_observations_does_not_matter(unit):
 
 
 @pytest.mark.fault(91)
+@pytest.mark.filterwarnings("ignore:the expert takes")
 def test_probes_that_no_memory_holds_are_refused(linear):
     with pytest.raises(SettingError, match="at 40 states does not fit into memory") as error:
         fdtasil.distill(linear, TOY, "sphere:1000000000000,forward", **QUICK)

@@ -13,7 +13,7 @@ from fdtasil import errors
 from fdtasil.datasets import Dataset
 from fdtasil.errors import SettingError, StorageError
 from fdtasil.seeding import episode_seeds, generator, torch_generator
-from fdtasil.storage import verify, write_bytes, write_folder
+from fdtasil.storage import sha256, to_json, verify, write_bytes, write_folder
 
 KINDS = [
     kind
@@ -69,6 +69,15 @@ def test_a_missing_or_changed_file_is_named(tmp_path):
     (tmp_path / "b").unlink()
     with pytest.raises(StorageError, match="No such file"):
         verify(tmp_path)
+
+
+@pytest.mark.parametrize("name", ["../outside", "/etc/hostname", "a/../../outside"])
+def test_a_manifest_reaches_no_file_outside_of_its_folder(name, tmp_path):
+    (tmp_path / "outside").write_bytes(b"1")
+    (tmp_path / "run" / "a").mkdir(parents=True)
+    (tmp_path / "run" / "manifest.json").write_bytes(to_json({name: sha256(b"1")}))
+    with pytest.raises(StorageError, match="outside of the folder"):
+        verify(tmp_path / "run")
 
 
 @pytest.mark.parametrize("data", [b"", b"nonsense", b"PK\x03\x04"])
