@@ -352,7 +352,7 @@ def script(tmp_path):
     started = []
 
     def start(busy="time.sleep(0.2)"):
-        folder = tmp_path / "pids"
+        folder = tmp_path / f"pids-{len(started)}"
         folder.mkdir()
         file = tmp_path / "script.py"
         file.write_text(textwrap.dedent(SCRIPT).format(folder=folder, busy=busy))
@@ -377,15 +377,19 @@ def script(tmp_path):
 
 
 @pytest.mark.fault(79)
-def test_a_killed_parent_leaves_no_worker(script):
+@pytest.mark.parametrize("kills", [1, pytest.param(100, marks=pytest.mark.slow)])
+def test_a_killed_parent_leaves_no_worker(kills, script, figure):
     stuck = "ctypes.PyDLL(None).sleep(100)"  # in C, without letting another thread run
     busy = "time.sleep(100)"
     if sys.platform == "linux":  # whose kernel ends such a process too
         busy += f" if rows.any() else {stuck}"
-    process, pids = script(busy)
-    assert len(pids) == 2
-    process.kill()
-    assert gone(pids)
+    for _ in range(kills):
+        process, pids = script(busy)
+        assert len(pids) == 2
+        process.kill()
+        process.communicate()
+        assert gone(pids)
+    figure(f"{kills} kills of a parent with two workers", "0 processes left")
 
 
 @pytest.mark.fault(79)
