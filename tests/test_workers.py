@@ -387,7 +387,7 @@ def test_a_killed_parent_leaves_no_worker(kills, script, figure):
         process, pids = script(busy)
         assert len(pids) == 2
         process.kill()
-        process.communicate()
+        process.wait()
         assert gone(pids)
     figure(f"{kills} kills of a parent with two workers", "0 processes left")
 
