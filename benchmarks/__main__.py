@@ -11,10 +11,11 @@ from benchmarks.quality import QUALITY
 from benchmarks.runner import BACKENDS, FIGURES, RESULTS, Benchmark, read_rows, results_of, run
 from benchmarks.speed import SPEED
 from benchmarks.stability import STABILITY
+from benchmarks.trainers import MUJOCO
 from fdtasil.storage import write_bytes
 
 BENCHMARKS: dict[str, Benchmark] = {
-    b.name: b for b in (FINITE_DIFFERENCE, QUALITY, NON_DIFFERENTIABLE, STABILITY, SPEED)
+    b.name: b for b in (FINITE_DIFFERENCE, MUJOCO, QUALITY, NON_DIFFERENTIABLE, STABILITY, SPEED)
 }
 
 
@@ -58,7 +59,11 @@ def _draw(benchmark: Benchmark, results: Path, out: Path) -> int:
     if not rows:
         print(f"no results of {benchmark.name} in {results}: run it first", file=sys.stderr)
         return 1
-    for name, data in benchmark.draw(rows).items():
+    files = benchmark.draw(rows)
+    if not files:
+        print(f"no part of {benchmark.name} is complete yet: run it on", file=sys.stderr)
+        return 1
+    for name, data in files.items():
         write_bytes(out / name, data)
         print(out / name)
     return 0

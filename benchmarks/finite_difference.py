@@ -103,7 +103,7 @@ def draw(rows: Sequence[Row]) -> dict[str, bytes]:
         files[f"finite_difference_{preset}.png"] = picture
         text += f"## Preset `{preset}`\n\n{scores_table(scores, list(methods))}\n"
         text += f"Differences on equal seeds:\n\n{differences_table(scores, PAIRS)}\n"
-    return files | {"finite_difference.md": text.strip().encode() + b"\n"}
+    return files and files | {"finite_difference.md": text.strip().encode() + b"\n"}
 
 
 FINITE_DIFFERENCE = Benchmark("finite_difference", __doc__ or "", cells, run, draw)

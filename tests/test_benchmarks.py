@@ -135,3 +135,23 @@ def test_the_quality_table_pairs_equal_seeds(tmp_path):
     table = QUALITY.draw(json.loads(json.dumps(rows)))["quality.md"].decode()
     assert "| e | 5 x 300 | 0.55" in table
     assert "+0.350" in table
+
+
+@pytest.mark.parametrize("name", ["finite_difference", "mujoco"])
+def test_methods_side_by_side(name):
+    """Drawn of complete groups only: a method or seed that is missing leaves its group out."""
+    from benchmarks.__main__ import BENCHMARKS
+
+    benchmark = BENCHMARKS[name]
+    budget = benchmark.cells(False)[0]["episodes"]
+    rows = [
+        {"cell": cell, "result": {"normalized_return": 0.5 + cell["seed"] / 10}}
+        for cell in benchmark.cells(False)
+        if cell["episodes"] == budget
+    ]
+    files = benchmark.draw(rows)
+    table = files[f"{name}.md"].decode()
+    assert "| 0.70 [0." in table
+    assert "+0.00 [+0.00, +0.00]" in table
+    assert all(data.startswith(b"\x89PNG") for file, data in files.items() if file.endswith("png"))
+    assert benchmark.draw(rows[:20]) == {}

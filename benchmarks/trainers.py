@@ -1,0 +1,65 @@
+"""The paper's main figure: cloning, DAgger, DART, each plain, with probes, with the Jacobian."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from benchmarks.comparison import differences_table, draw_panels, scores_of, scores_table
+from benchmarks.controllers import available
+from benchmarks.distillation import distil_cell
+from benchmarks.finite_difference import experts
+from benchmarks.runner import Benchmark, Cell, Row
+
+__all__ = ["MUJOCO"]
+
+SEEDS = range(5)
+HORIZON = 300
+BUDGETS = (5, 20)
+SOURCES: dict[str, int | str] = {"plain": 0, "probes": 10, "jacobian": "jacobian"}
+METHODS = {
+    f"{trainer}, {source}": {"trainer": trainer, "probes": probes}
+    for trainer in ("bc", "dagger", "dart")
+    for source, probes in SOURCES.items()
+}
+# What probes add to each trainer, and what each trainer adds to probes.
+PAIRS = (
+    ("bc, probes", "bc, plain"),
+    ("dagger, probes", "dagger, plain"),
+    ("dart, probes", "dart, plain"),
+    ("bc, probes", "dagger, plain"),
+    ("dagger, probes", "bc, probes"),
+    ("dart, probes", "bc, probes"),
+)
+
+
+def cells(quick: bool) -> list[Cell]:
+    """Every budget, seed, expert and method."""
+    names = [*experts(), *available("Swimmer-v5")]
+    return [
+        {"expert": expert, "episodes": budget, "method": method, "seed": seed}
+        for budget in (BUDGETS[:1] if quick else BUDGETS)
+        for seed in (range(2) if quick else SEEDS)
+        for expert in (names[:1] if quick else names)
+        for method in METHODS
+    ]
+
+
+def run(cell: Cell) -> dict[str, Any]:
+    """Distil by the cell's trainer and source, defaults otherwise."""
+    settings = {"expert": cell["expert"], "episodes": cell["episodes"], "seed": cell["seed"]}
+    return distil_cell({**settings, "horizon": HORIZON, **METHODS[cell["method"]]})
+
+
+def draw(rows: Sequence[Row]) -> dict[str, bytes]:
+    """One picture and two tables, of the budgets that are complete."""
+    scores = scores_of(rows, list(METHODS), len(SEEDS))
+    if not scores:
+        return {}
+    differences = differences_table(scores, PAIRS)
+    text = f"{scores_table(scores, list(METHODS))}\nDifferences on equal seeds:\n\n{differences}"
+    return {
+        "mujoco.png": draw_panels(scores, list(METHODS), lambda method: method),
+        "mujoco.md": text.encode(),
+    }
+
+
+MUJOCO = Benchmark("mujoco", __doc__ or "", cells, run, draw)
