@@ -36,7 +36,11 @@ def pytest_terminal_summary(terminalreporter, config):
         return
     kinds = ("passed", "failed", "error")
     reports = [report for kind in kinds for report in terminalreporter.getreports(kind)]
-    properties = [(report.passed, *pair) for report in reports for pair in report.user_properties]
+    properties = [
+        (report.passed, *pair)
+        for report in reports
+        for pair in getattr(report, "user_properties", ())  # a file that failed to load has none
+    ]
     bad = {value for passed, name, value in properties if name == "fault" and not passed}
     good = {value for passed, name, value in properties if name == "fault" and passed} - bad
     lines = ["| faults in | listed | tested | ended as required |", "|---|---|---|---|"]
