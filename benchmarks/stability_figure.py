@@ -1,6 +1,5 @@
 """The picture of the stability experiment."""
 
-import io
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -9,6 +8,7 @@ import numpy as np
 from benchmarks.runner import Row
 from benchmarks.stability_table import NAMES, STARTS, THRESHOLDS, Results, grouped
 from benchmarks.statistics import interval
+from fdtasil.figures import png_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -45,9 +45,7 @@ def draw_figure(rows: Sequence[Row]) -> bytes:
         panel.set_xlabel("$\\nu$, where $\\gamma(r) = 5\\,r^\\nu$", fontsize=9)
     handles, labels = panels[0][0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside lower center", ncols=3, frameon=False, fontsize=8)
-    target = io.BytesIO()
-    figure.savefig(target, format="png", dpi=200, metadata={"Software": None})
-    return target.getvalue()
+    return png_of(figure, dpi=200)
 
 
 def _curve(
