@@ -11,7 +11,7 @@ if TYPE_CHECKING:
 
     from fdtasil.calibration import Calibration
 
-__all__ = ["draw_calibration", "draw_returns", "draw_training"]
+__all__ = ["draw_calibration", "draw_returns", "draw_training", "png_of"]
 
 _STUDENT, _EXPERT = "#1f77b4", "#444444"
 
@@ -33,7 +33,7 @@ def draw_training(history: Sequence[dict[str, float]]) -> bytes:
         panel.set_xlabel("training step")
         panel.set_ylabel("mean norm")
         panel.grid(alpha=0.3, which="both", linewidth=0.5)
-    return _png(figure)
+    return png_of(figure)
 
 
 def draw_returns(evaluation: Evaluation) -> bytes:
@@ -63,7 +63,7 @@ def draw_returns(evaluation: Evaluation) -> bytes:
     panel.set_ylim(bottom=min(0.0, *expert, *student))
     panel.grid(alpha=0.3, axis="y", linewidth=0.5)
     panel.legend(frameon=False, fontsize=8, loc="lower left", ncols=2)
-    return _png(figure)
+    return png_of(figure)
 
 
 def draw_calibration(found: "Calibration") -> bytes:
@@ -86,7 +86,7 @@ def draw_calibration(found: "Calibration") -> bytes:
         panel.set_xlabel("radius, standard deviations", fontsize=9)
         panel.grid(alpha=0.3, linewidth=0.5)
     change.legend(frameon=False, fontsize=7)
-    return _png(figure)
+    return png_of(figure)
 
 
 def _cumulative_steps(history: Sequence[dict[str, float]]) -> list[float]:
@@ -106,7 +106,8 @@ def _figure(width: float, height: float) -> "Figure":
     return Figure(figsize=(width, height), layout="constrained")
 
 
-def _png(figure: "Figure") -> bytes:
+def png_of(figure: "Figure", dpi: int = 150) -> bytes:
+    """Return a figure as a PNG that does not name the version that drew it."""
     target = io.BytesIO()
-    figure.savefig(target, format="png", dpi=150, metadata={"Software": None})
+    figure.savefig(target, format="png", dpi=dpi, metadata={"Software": None})
     return target.getvalue()

@@ -4,39 +4,40 @@ import signal
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
-from types import FrameType, TracebackType
+from types import FrameType
 
-__all__ = ["Interrupts"]
+__all__ = ["Interrupts", "heard_interrupts"]
+
+
+@contextmanager
+def heard_interrupts() -> Iterator["Interrupts"]:
+    """Turn SIGINT and SIGTERM inside the block into exceptions.
+
+    A handler that is not Python's own is left in charge, and so are those of the main thread where
+    a run goes on in another one.
+    """
+    interrupts, before = Interrupts(), {}
+    usual = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
+    try:
+        if threading.current_thread() is threading.main_thread():
+            for number, handler in usual.items():
+                if signal.getsignal(number) == handler:
+                    before[number] = signal.signal(number, interrupts.hear)
+        yield interrupts
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, handler)
 
 
 class Interrupts:
-    """Turns the first SIGINT or SIGTERM inside the block into an exception.
+    """The signals of a run: at once, or held back to a moment of its choice.
 
     KeyboardInterrupt for SIGINT, SystemExit with code 143 for SIGTERM, so that files and worker
-    processes are closed on the way out. A handler that is not Python's own is left in charge, and
-    so is the main thread's where a run goes on in another one.
+    processes are closed on the way out.
     """
 
     def __init__(self) -> None:
-        self._before: dict[int, object] = {}
         self._held, self._waiting = False, 0
-
-    def __enter__(self) -> "Interrupts":
-        if threading.current_thread() is threading.main_thread():
-            usual = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
-            for number, handler in usual.items():
-                if signal.getsignal(number) == handler:
-                    self._before[number] = signal.signal(number, self._hear)
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, handler)  # pyright: ignore[reportArgumentType]
 
     @contextmanager
     def held_back(self) -> Iterator[None]:
@@ -60,7 +61,8 @@ class Interrupts:
         if self._waiting:
             raise SystemExit(128 + self._waiting)
 
-    def _hear(self, number: int, frame: FrameType | None) -> None:
+    def hear(self, number: int, frame: FrameType | None) -> None:
+        """Handle a signal: the first may wait, a second never does."""
         patient = self._held and not self._waiting
         self._waiting = number
         if not patient:

@@ -34,9 +34,8 @@ __all__ = [
 ]
 
 _OPSET = 18  # old enough for the runtimes on robots, new enough for torch's exporter
-_SIZE_LIMIT = (
-    2**30
-)  # bytes, with the side files; a protobuf message can't have more than twice that
+# Bytes, with the side files; a protobuf message can't have more than twice that.
+_SIZE_LIMIT = 2**30
 # Whose operators come with onnxruntime; the others are in libraries of native code.
 _DOMAINS = ("ai.onnx", "com.microsoft")
 

@@ -16,14 +16,14 @@ from fdtasil.errors import FdtasilWarning
 from fdtasil.evaluation import Evaluation, check_episodes, compare
 from fdtasil.events import Callback, Event, tell_all
 from fdtasil.experts import Expert, ExpertLike, check_expert, load_expert
-from fdtasil.interrupts import Interrupts
+from fdtasil.interrupts import heard_interrupts
 from fdtasil.presets import preset_of
 from fdtasil.probes import Probes
 from fdtasil.progress import Stages
 from fdtasil.report import noted_warnings, report_of, versions
 from fdtasil.rollouts import Episodes, Policy, first_observations, follow, rollout
 from fdtasil.rounds import Rounds
-from fdtasil.runfolder import RunFolder
+from fdtasil.runfolder import open_run_folder
 from fdtasil.sb3 import Trust
 from fdtasil.seeding import check_seed, episode_seeds
 from fdtasil.storage import sha256
@@ -214,8 +214,8 @@ def distill(
         folder = None if place_of_run is None else Path(place_of_run)
         config = {**run.to_json(), "versions": versions()}
         with (
-            RunFolder(folder, config, resume=resume is not None) as kept,
-            Interrupts() as interrupts,
+            open_run_folder(folder, config, resume=resume is not None) as kept,
+            heard_interrupts() as interrupts,
         ):
             if folder and kept.finished and resume is not None:
                 return Distilled.load(folder, student_obs)

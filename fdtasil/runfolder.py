@@ -3,73 +3,79 @@
 import json
 import shutil
 import warnings
-from collections.abc import Callable
-from contextlib import ExitStack
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
-from types import TracebackType
 from typing import Any
 
 from fdtasil.errors import FdtasilWarning, SettingError, StorageError
-from fdtasil.lock import FolderLock
+from fdtasil.lock import locked
 from fdtasil.storage import is_written, to_json, verify, write_bytes, write_folder
 
-__all__ = ["RunFolder"]
+__all__ = ["RunFolder", "open_run_folder"]
 
 _CONFIG = "config.json"
 _CHECKPOINTS = "checkpoints"
+
+
+@contextmanager
+def open_run_folder(
+    path: Path | None, config: dict[str, Any], *, resume: bool
+) -> Iterator["RunFolder"]:
+    """Keep a run in a folder that no other process writes inside the block.
+
+    An error that leaves the block says how to go on.
+
+    Args:
+        path: The folder, or None to keep nothing.
+        config: The run's configuration as plain JSON, with versions.
+        resume: Whether the folder holds this run's beginning.
+
+    Raises:
+        SettingError: If there is nothing to resume, the folder's run has another configuration,
+            or a new run would overwrite an unfinished one.
+        StorageError: If the folder can't be written, or another process writes it.
+    """
+    folder = RunFolder(path, config)
+    if path is None:
+        yield folder
+        return
+    before = _read_config(path) if resume else None
+    going_on = f'go on with resume="{path}" (--resume {path})'
+    with locked(path):
+        if before is not None:
+            _check_same(before, config, path)
+        elif folder.begun:
+            raise SettingError(
+                f"{path} holds an unfinished run",
+                "an empty folder, or a finished run (which is replaced)",
+                f"{going_on}, or remove the folder",
+            )
+        try:
+            yield folder
+        except BaseException as error:
+            if folder.begun:
+                error.add_note(f"what is done is kept: {going_on}")
+            raise
 
 
 class RunFolder:
     """Where a run keeps what it must not lose. Without a path it keeps nothing.
 
     Checkpoints are folders `checkpoints/<round>/<stage>-<number>/`, each with a manifest as its
-    last file: one that has none, or does not verify, never counts. Inside the block no other
-    process writes the folder; an error that leaves the block says how to go on.
+    last file: one that has none, or does not verify, never counts.
 
     Args:
         path: The folder, or None.
         config: The run's configuration as plain JSON, with versions.
-        resume: Whether the folder holds this run's beginning.
-
-    Raises:
-        SettingError: On entering the block, if there is nothing to resume, the folder's run has
-            another configuration, or a new run would overwrite an unfinished one.
-        StorageError: If the folder can't be written, or another process writes it.
     """
 
-    def __init__(self, path: Path | None, config: dict[str, Any], *, resume: bool) -> None:
-        self._path, self._config, self._resume = path, config, resume
-        self._lock = ExitStack()
-
-    def __enter__(self) -> "RunFolder":
-        if self._path is None:
-            return self
-        before = _read_config(self._path) if self._resume else None
-        with ExitStack() as lock:
-            lock.enter_context(FolderLock(self._path))
-            if before is not None:
-                _check_same(before, self._config, self._path)
-            elif self._begun:
-                raise SettingError(
-                    f"{self._path} holds an unfinished run",
-                    "an empty folder, or a finished run (which is replaced)",
-                    f"{_going_on(self._path)}, or remove the folder",
-                )
-            self._lock = lock.pop_all()
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        traceback: TracebackType | None,
-    ) -> None:
-        if error is not None and self._begun:
-            error.add_note(f"what is done is kept: {_going_on(self._path)}")
-        self._lock.close()
+    def __init__(self, path: Path | None, config: dict[str, Any]) -> None:
+        self._path, self._config = path, config
 
     @property
-    def _begun(self) -> bool:
+    def begun(self) -> bool:
+        """Whether there is a checkpoint to go on from."""
         return self._path is not None and any((self._path / _CHECKPOINTS).glob("*/*"))
 
     @property
@@ -117,10 +123,6 @@ class RunFolder:
         """Drop the checkpoints of a run that is saved."""
         if self._path is not None:
             shutil.rmtree(self._path / _CHECKPOINTS, ignore_errors=True)
-
-
-def _going_on(path: Path | None) -> str:
-    return f'go on with resume="{path}" (--resume {path})'
 
 
 def _read_config(path: Path) -> dict[str, Any]:

@@ -7,32 +7,21 @@ for all tensors, also those of attributes, sub-graphs and functions, whatever th
 import os
 import stat
 from collections.abc import Iterator, Mapping
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from fdtasil.errors import ExpertError, first_line, shown
+from fdtasil.storage import stays_inside
 
 if TYPE_CHECKING:
     import onnx
 
-__all__ = ["load_side_files", "names_of_side_files", "stays_inside"]
+__all__ = ["load_side_files", "names_of_side_files"]
 
 
 def names_of_side_files(model: "onnx.ModelProto") -> set[str]:
     """Return the side files that a model names, whatever they are."""
     return {_entries(tensor).get("location", "") for tensor in _outside(model)}
-
-
-def stays_inside(name: str) -> bool:
-    r"""Whether a name is readable and stays in the folder that it is relative to, on any system.
-
-    Example:
-        >>> [stays_inside(name) for name in ("a/b.weights", "../b", "/b", "a\0b", "c:b")]
-        [True, False, False, False, False]
-    """
-    path = PurePosixPath(name)
-    clean = name.isprintable() and not set("\\:") & set(name)
-    return bool(path.parts) and clean and not path.is_absolute() and ".." not in path.parts
 
 
 def load_side_files(model: "onnx.ModelProto", path: Path, room: int) -> bytes:

@@ -13,7 +13,7 @@ import os
 import secrets
 import shutil
 from collections.abc import Mapping
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from typing import Any
 
 from fdtasil.errors import StorageError
@@ -22,6 +22,7 @@ __all__ = [
     "explain",
     "is_written",
     "sha256",
+    "stays_inside",
     "to_json",
     "verify",
     "write_bytes",
@@ -61,7 +62,8 @@ def write_folder(folder: Path, files: Mapping[str, bytes]) -> None:
         files: Content by name relative to `folder`.
 
     Raises:
-        StorageError: As `write_bytes`; the folder then reads as before.
+        StorageError: As `write_bytes`; the folder then reads as before, or as after where all was
+            written and only the move failed.
     """
     coming = folder / _COMING
     _move_in(folder)
@@ -94,7 +96,7 @@ def verify(folder: Path) -> dict[str, bytes]:
         # Nothing but what we write: a manifest that was changed must not pass for a shorter one.
         if to_json(manifest) != listed or not isinstance(manifest, dict):
             raise ValueError(f"{MANIFEST} changed after writing")
-        if any(Path(name).is_absolute() or ".." in Path(name).parts for name in manifest):
+        if not all(map(stays_inside, manifest)):
             raise ValueError(f"{MANIFEST} names a file outside of the folder")
         files = {name: _place(folder, name).read_bytes() for name in manifest}
     except (OSError, ValueError) as error:
@@ -114,6 +116,18 @@ def verify(folder: Path) -> dict[str, bytes]:
 def is_written(folder: Path) -> bool:
     """Return whether a folder has a manifest: everything else was there before it."""
     return _place(folder, MANIFEST).exists()
+
+
+def stays_inside(name: str) -> bool:
+    r"""Whether a name is readable and stays in the folder that it is relative to, on any system.
+
+    Example:
+        >>> [stays_inside(name) for name in ("a/b.weights", "../b", "/b", "a\0b", "c:b")]
+        [True, False, False, False, False]
+    """
+    path = PurePosixPath(name)
+    clean = name.isprintable() and not set("\\:") & set(name)
+    return bool(path.parts) and clean and not path.is_absolute() and ".." not in path.parts
 
 
 def _write(path: Path, data: bytes) -> None:

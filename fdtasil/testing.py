@@ -1,6 +1,7 @@
 """Checks that anyone can run on an expert or a student of their own: one named result each."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -56,23 +57,13 @@ def check_expert(
         []
     """
     with EnvironmentPool(env) as pool:
-        boxes, length = pool.boxes, resolve_horizon(horizon, pool)
-        sizes = boxes.observation_size, boxes.action_size
-        try:
-            opened = load_expert(expert, *sizes, output=output, trust=trust)
-        except ExpertError as error:
-            return [Finding("opening", error.found, error)]
-        findings = [Finding("opening", f"{opened.name}: {sizes[0]} -> {sizes[1]} numbers", None)]
-        starts = episode_seeds(seed, "evaluation", 0, _EPISODES)
-        try:
-            own = rollout(follow(opened.policy("act")), pool, starts, length)
-        except ExpertError as error:
-            return [*findings, Finding("answers", error.found, error)]
+        looked = _look(expert, pool, horizon, seed, output, trust)
+        if looked.own is None or looked.expert is None:
+            return looked.findings
         noise = [generator(seed, "random actions", episode) for episode in range(_EPISODES)]
+        starts, length = looked.own.seeds.tolist(), looked.own.valid.shape[1]
         chance = rollout(random_behaviour(pool), pool, starts, length, noise)
-        states = _spread(own)
-        findings += [*examine_expert(opened, states, boxes), _batch_sizes(opened, states)]
-        return [*findings, _better_than(own, chance, opened.name)]
+        return [*looked.findings, _better_than(looked.own, chance, looked.expert.name)]
 
 
 def check_student(
@@ -102,20 +93,46 @@ def check_student(
         ['far states']
     """
     with EnvironmentPool(env) as pool:
-        boxes, length = pool.boxes, resolve_horizon(horizon, pool)
-        try:
-            opened = load_expert(student, boxes.observation_size, boxes.action_size)
-        except ExpertError as error:
-            return [Finding("opening", error.found, error)]
-        findings = [Finding("opening", opened.name, None)]
-        starts = episode_seeds(seed, "evaluation", 0, _EPISODES)
-        try:
-            states = _spread(rollout(follow(opened.policy("act")), pool, starts, length))
-        except ExpertError as error:
-            return [*findings, Finding("answers", error.found, error)]
-    findings += examine_expert(opened, states, boxes)
-    findings += [_batch_sizes(opened, states), _far(opened, states, boxes)]
+        looked = _look(student, pool, horizon, seed)
+        if looked.own is None or looked.expert is None:
+            return looked.findings
+        states = _spread(looked.own)
+        findings = [*looked.findings, _far(looked.expert, states, pool.boxes)]
     return [*findings, _export(student, states)] if isinstance(student, Student) else findings
+
+
+@dataclass(frozen=True)
+class _Looked:
+    """What the checks of experts and students share: it was opened, followed and examined."""
+
+    findings: list[Finding]
+    expert: Expert | None = None
+    own: Episodes | None = None
+
+
+def _look(
+    policy: ExpertLike,
+    pool: EnvironmentPool,
+    horizon: int | None,
+    seed: int,
+    output: str | None = None,
+    trust: Trust = None,
+) -> _Looked:
+    boxes, length = pool.boxes, resolve_horizon(horizon, pool)
+    sizes = boxes.observation_size, boxes.action_size
+    try:
+        opened = load_expert(policy, *sizes, output=output, trust=trust)
+    except ExpertError as error:
+        return _Looked([Finding("opening", error.found, error)])
+    opening = Finding("opening", f"{opened.name}: {sizes[0]} -> {sizes[1]} numbers", None)
+    try:
+        starts = episode_seeds(seed, "evaluation", 0, _EPISODES)
+        own = rollout(follow(opened.policy("act")), pool, starts, length)
+    except ExpertError as error:
+        return _Looked([opening, Finding("answers", error.found, error)])
+    states = _spread(own)
+    examined = [*examine_expert(opened, states, boxes), _batch_sizes(opened, states)]
+    return _Looked([opening, *examined], opened, own)
 
 
 def _spread(episodes: Episodes) -> np.ndarray:

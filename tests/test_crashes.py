@@ -16,12 +16,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import QUICK, TOY, mlp_onnx
+from test_resume import FILES, Stop, read, stop_at
 
 import fdtasil
 from fdtasil import rounds
 from fdtasil.errors import FdtasilWarning, StorageError
 
-FILES = ("student.safetensors", "student.onnx", "demonstrations.npz", "config.json")
 RUN = {**QUICK, "trainer": "dagger", "probes": "sphere:2,resample", "episodes": 6, "steps": 150}
 SHORT = {**QUICK, "probes": 2, "steps": 3}
 
@@ -100,10 +100,6 @@ def golden(nursery, expert, tmp_path_factory):
     nursery.start(expert, out=folder, **RUN)
     assert nursery.end() == 0
     return read(folder), time.monotonic() - started
-
-
-def read(folder):
-    return {name: (Path(folder) / name).read_bytes() for name in FILES}
 
 
 def begun(folder):
@@ -353,9 +349,6 @@ def test_checkpoints_hold_what_plain_readers_read(expert, tmp_path):
     """safetensors, arrays without pickles, JSON: read back here by other code than ours."""
     from safetensors.numpy import load_file
 
-    class Stop(Exception):
-        pass
-
     def stop(event):
         if event.round == 1:
             raise Stop
@@ -374,14 +367,8 @@ def test_checkpoints_hold_what_plain_readers_read(expert, tmp_path):
 
 @pytest.mark.fault(114)
 def test_other_versions_are_said(expert, tmp_path):
-    class Stop(Exception):
-        pass
-
-    def stop(event):
-        raise Stop
-
     with pytest.raises(Stop):
-        fdtasil.distill(expert, TOY, out=tmp_path, callback=stop, **RUN)
+        fdtasil.distill(expert, TOY, out=tmp_path, callback=stop_at(1), **RUN)
     path = tmp_path / "checkpoints" / "config.json"
     config = json.loads(path.read_text())
     config["versions"]["torch"] = "1.0"

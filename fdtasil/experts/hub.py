@@ -16,8 +16,7 @@ from typing import TYPE_CHECKING, TypeGuard, TypeVar
 
 from fdtasil.errors import ExpertError, first_line
 from fdtasil.onnx_files import side_files
-from fdtasil.side_files import stays_inside
-from fdtasil.storage import sha256, write_bytes
+from fdtasil.storage import sha256, stays_inside, write_bytes
 
 if TYPE_CHECKING:
     from huggingface_hub.hf_api import RepoSibling
