@@ -8,14 +8,35 @@ import benchmarks
 from benchmarks.finite_difference import FINITE_DIFFERENCE
 from benchmarks.non_differentiable import NON_DIFFERENTIABLE
 from benchmarks.quality import QUALITY
-from benchmarks.runner import BACKENDS, FIGURES, RESULTS, Benchmark, read_rows, results_of, run
+from benchmarks.queries import QUERIES
+from benchmarks.robustness import ROBUSTNESS
+from benchmarks.runner import (
+    BACKENDS,
+    FIGURES,
+    RESULTS,
+    Benchmark,
+    known_results,
+    read_rows,
+    results_of,
+    run,
+)
 from benchmarks.speed import SPEED
 from benchmarks.stability import STABILITY
 from benchmarks.trainers import MUJOCO
 from fdtasil.storage import write_bytes
 
 BENCHMARKS: dict[str, Benchmark] = {
-    b.name: b for b in (FINITE_DIFFERENCE, MUJOCO, QUALITY, NON_DIFFERENTIABLE, STABILITY, SPEED)
+    benchmark.name: benchmark
+    for benchmark in (
+        FINITE_DIFFERENCE,
+        MUJOCO,
+        QUERIES,
+        ROBUSTNESS,
+        QUALITY,
+        NON_DIFFERENTIABLE,
+        STABILITY,
+        SPEED,
+    )
 }
 
 
@@ -40,22 +61,29 @@ def main() -> int:
     benchmark = BENCHMARKS[arguments.name]
     if arguments.command == "draw":
         return _draw(benchmark, arguments.results, arguments.out)
-    path = arguments.out / f"{benchmark.name}.jsonl"
+    path = benchmark.results(arguments.out)
     cells = benchmark.cells(arguments.quick)
-    failed = run(benchmark, cells, path, workers=arguments.workers, backend=arguments.backend)
+    failed = run(
+        benchmark,
+        cells,
+        path,
+        workers=arguments.workers,
+        backend=arguments.backend,
+        known=known_results(BENCHMARKS.values(), arguments.out),
+    )
     print(f"{benchmark.name}: {len(cells)} cells, {len(failed)} failed now; results in {path}")
     return min(len(failed), 1)
 
 
 def _list() -> int:
     for name, benchmark in BENCHMARKS.items():
-        done = len(results_of(read_rows(RESULTS / f"{name}.jsonl")))
+        done = len(results_of(read_rows(benchmark.results(RESULTS))))
         print(f"{name:20}{done:5} of {len(benchmark.cells(False)):5} cells  {benchmark.about}")
     return 0
 
 
 def _draw(benchmark: Benchmark, results: Path, out: Path) -> int:
-    rows = results_of(read_rows(results / f"{benchmark.name}.jsonl"))
+    rows = results_of(read_rows(benchmark.results(results)))
     if not rows:
         print(f"no results of {benchmark.name} in {results}: run it first", file=sys.stderr)
         return 1

@@ -1,22 +1,42 @@
 """The cell that most benchmarks share: distil one expert with one setting and seed."""
 
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import fdtasil
 from benchmarks.controllers import CONTROLLERS
-from benchmarks.runner import Cell
+from benchmarks.runner import Benchmark, Cell, Row
 
-__all__ = ["distil_cell"]
+__all__ = ["distillations"]
 
 
-def distil_cell(cell: Cell) -> dict[str, Any]:
-    """Distil, and return what tables and figures need of the report.
+def distillations(
+    name: str,
+    about: str,
+    cells: Callable[[bool], Sequence[Cell]],
+    arguments: Callable[[Cell], dict[str, Any]],
+    draw: Callable[[Sequence[Row]], Mapping[str, bytes]],
+) -> Benchmark:
+    """Return a benchmark each cell of which is one distillation; see `Benchmark`.
 
     Args:
-        cell: `expert`, a name of `CONTROLLERS`; the rest are arguments of `distill`.
+        name: Of the results file and the command.
+        about: What it shows.
+        cells: Whether to be quick -> the cells.
+        arguments: A cell -> `expert`, a name of `CONTROLLERS`, and those arguments of `distill`
+            that are not left at their defaults.
+        draw: Rows -> files.
     """
-    arguments = dict(cell)
-    path, environment = CONTROLLERS[arguments.pop("expert")].open()
+
+    def run(cell: Cell) -> dict[str, Any]:
+        return _distil(**arguments(cell))
+
+    return Benchmark(name, about, cells, run, draw, arguments=arguments)
+
+
+def _distil(expert: str, **arguments: Any) -> dict[str, Any]:
+    """Distil, and return what tables and figures need of the report."""
+    path, environment = CONTROLLERS[expert].open()
     result = fdtasil.distill(path, environment, progress=False, **arguments)
     report, evaluation = result.report, result.evaluation
     assert evaluation is not None

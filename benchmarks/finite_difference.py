@@ -5,8 +5,8 @@ from typing import Any
 
 from benchmarks.comparison import differences_table, draw_panels, scores_of, scores_table
 from benchmarks.controllers import available
-from benchmarks.distillation import distil_cell
-from benchmarks.runner import Benchmark, Cell, Row
+from benchmarks.distillation import distillations
+from benchmarks.runner import Cell, Row
 
 __all__ = ["FINITE_DIFFERENCE"]
 
@@ -66,19 +66,17 @@ def experts() -> list[str]:
     return here or available(*(f"{name}-v5" for name in ENVIRONMENTS))
 
 
-def run(cell: Cell) -> dict[str, Any]:
-    """Distil by the cell's method, with its preset."""
+def arguments(cell: Cell) -> dict[str, Any]:
+    """Return the cell's method, with its preset."""
     preset, method = cell["preset"], cell["method"]
-    return distil_cell(
-        {
-            "expert": cell["expert"],
-            "episodes": cell["episodes"],
-            "seed": cell["seed"],
-            "horizon": HORIZON,
-            **PRESETS[preset],
-            **METHODS[preset][method],
-        }
-    )
+    return {
+        "expert": cell["expert"],
+        "episodes": cell["episodes"],
+        "seed": cell["seed"],
+        "horizon": HORIZON,
+        **PRESETS[preset],
+        **METHODS[preset][method],
+    }
 
 
 # The appendix's claims, and the rival: ours - theirs on equal seeds.
@@ -106,4 +104,4 @@ def draw(rows: Sequence[Row]) -> dict[str, bytes]:
     return files and files | {"finite_difference.md": text.strip().encode() + b"\n"}
 
 
-FINITE_DIFFERENCE = Benchmark("finite_difference", __doc__ or "", cells, run, draw)
+FINITE_DIFFERENCE = distillations("finite_difference", __doc__ or "", cells, arguments, draw)

@@ -3,9 +3,9 @@
 from collections.abc import Sequence
 
 from benchmarks.controllers import available
-from benchmarks.distillation import distil_cell
-from benchmarks.runner import Benchmark, Cell, Row
-from benchmarks.statistics import interval_text, paired_difference
+from benchmarks.distillation import distillations
+from benchmarks.runner import Cell, Row
+from benchmarks.statistics import difference_text, interval_text, paired_difference
 
 __all__ = ["QUALITY"]
 
@@ -59,7 +59,7 @@ def _line(rows: Sequence[Row], head: str) -> list[str]:
         return []
     score = {seed: result["normalized_return"] for seed, result in ours.items()}
     base = {seed: result["normalized_return"] for seed, result in plain.items()}
-    mean, (low, high) = paired_difference(score, base)
+    difference = paired_difference(score, base)
     survival = [
         sum(result[name] for result in ours.values()) / len(ours)
         for name in ("expert_survival", "survival")
@@ -67,9 +67,9 @@ def _line(rows: Sequence[Row], head: str) -> list[str]:
     seconds = sum(result["train_seconds"] for result in ours.values()) / len(ours)
     return [
         f"| {head} | {interval_text(list(base.values()))} | {interval_text(list(score.values()))} "
-        f"| {mean:+.3f} [{low:+.3f}, {high:+.3f}] | {min(score.values()):.2f} "
+        f"| {difference_text(*difference, 3)} | {min(score.values()):.2f} "
         f"| {survival[0]:.2f}, {survival[1]:.2f} | {seconds:.0f} |"
     ]
 
 
-QUALITY = Benchmark("quality", __doc__ or "", cells, distil_cell, draw)
+QUALITY = distillations("quality", __doc__ or "", cells, dict, draw)

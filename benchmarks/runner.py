@@ -17,7 +17,16 @@ from tqdm import tqdm
 
 from fdtasil.report import versions
 
-__all__ = ["BACKENDS", "Benchmark", "Cell", "Row", "read_rows", "results_of", "run"]
+__all__ = [
+    "BACKENDS",
+    "Benchmark",
+    "Cell",
+    "Row",
+    "known_results",
+    "read_rows",
+    "results_of",
+    "run",
+]
 
 HERE = Path(__file__).parent
 RESULTS = HERE / "results"
@@ -26,7 +35,8 @@ FIGURES = HERE / "figures"
 Cell = Mapping[str, Any]
 """One configuration with one seed, as plain JSON values; the row of a cell is found by it."""
 Row = Mapping[str, Any]
-"""`cell`, `result` or `error`, `seconds`, `versions`, `commit`, `machine`."""
+"""`cell`, `result` or `error`, `seconds`, `versions`, `commit`, `machine`; `from`, the benchmark
+whose cell it was, where another one has run it."""
 
 
 @dataclass(frozen=True)
@@ -40,6 +50,8 @@ class Benchmark:
         run: A cell -> its result, as plain JSON values. Runs in a process of one thread.
         draw: The rows that have a result -> files by name, for the folder of figures.
         alone: Whether a cell measures time, and must not run beside another.
+        arguments: A cell -> the arguments of the distillation that it is. Benchmarks share the
+            results of equal ones. None where a cell is something else.
     """
 
     name: str
@@ -48,6 +60,11 @@ class Benchmark:
     run: Callable[[Cell], dict[str, Any]]
     draw: Callable[[Sequence[Row]], Mapping[str, bytes]]
     alone: bool = False
+    arguments: Callable[[Cell], Mapping[str, Any]] | None = None
+
+    def results(self, folder: Path) -> Path:
+        """Return the results file in a folder."""
+        return folder / f"{self.name}.jsonl"
 
 
 def run(
@@ -57,6 +74,7 @@ def run(
     *,
     workers: int = 1,
     backend: str = "loky",
+    known: Mapping[str, Row] | None = None,
 ) -> list[Row]:
     """Run the cells that have no result yet, and append their rows to the results file.
 
@@ -66,6 +84,7 @@ def run(
         path: The results file, one JSON object a line; made if it is not there.
         workers: Processes at once, one thread each.
         backend: One of `BACKENDS`.
+        known: From `known_results`: what other benchmarks have run already.
 
     Returns:
         The rows of those cells that failed now.
@@ -76,9 +95,12 @@ def run(
     if path.exists() and not path.read_text().endswith("\n"):
         with path.open("a") as file:
             file.write("\n")  # a kill cut the last line short: leave it to itself
+    reused = _reused(benchmark, due, known or {})
+    due = [cell for cell in due if _key(cell) not in reused]
     failed = []
     about = {"commit": _commit(), "versions": versions()}
     with path.open("a") as file:
+        file.writelines(json.dumps(row) + "\n" for row in reused.values())
         rows = BACKENDS[backend](benchmark, due, 1 if benchmark.alone else workers)
         for row in tqdm(rows, total=len(due), desc=benchmark.name, unit="cell", mininterval=5):
             # The parent alone writes, whole lines at once: a kill loses the cells under way.
@@ -88,6 +110,24 @@ def run(
                 failed.append(row)
                 tqdm.write(f"FAILED {json.dumps(row['cell'])}\n{row['error']}", file=sys.stderr)
     return failed
+
+
+def known_results(benchmarks: Iterable[Benchmark], folder: Path) -> dict[str, Row]:
+    """Return the rows of distillations by their arguments, whichever benchmark ran them.
+
+    Args:
+        benchmarks: Whose results are looked at.
+        folder: Of the results files.
+    """
+    found: dict[str, Row] = {}
+    for benchmark in benchmarks:
+        if benchmark.arguments is None:
+            continue
+        rows = {_key(row["cell"]): row for row in results_of(read_rows(benchmark.results(folder)))}
+        for cell in benchmark.cells(False):
+            if (row := rows.get(_key(cell))) is not None:
+                found[_key(benchmark.arguments(cell))] = {"from": benchmark.name, **row}
+    return found
 
 
 def read_rows(path: Path) -> list[Row]:
@@ -104,6 +144,20 @@ def read_rows(path: Path) -> list[Row]:
 def results_of(rows: Iterable[Row]) -> list[Row]:
     """Return the newest row with a result of each cell."""
     return list({_key(row["cell"]): row for row in rows if "result" in row}.values())
+
+
+def _reused(
+    benchmark: Benchmark, cells: Sequence[Cell], known: Mapping[str, Row]
+) -> dict[str, Row]:
+    """Return the rows of those cells whose distillation another benchmark has run."""
+    if benchmark.arguments is None:
+        return {}
+    found = {_key(cell): known.get(_key(benchmark.arguments(cell))) for cell in cells}
+    return {
+        _key(cell): {**row, "cell": dict(cell)}
+        for cell in cells
+        if (row := found[_key(cell)]) is not None
+    }
 
 
 def _on_loky(benchmark: Benchmark, cells: Sequence[Cell], workers: int) -> Iterable[Row]:

@@ -6,7 +6,13 @@ from functools import partial
 import numpy as np
 from scipy import stats
 
-__all__ = ["interquartile_mean", "interval", "interval_text", "paired_difference"]
+__all__ = [
+    "difference_text",
+    "interquartile_mean",
+    "interval",
+    "interval_text",
+    "paired_difference",
+]
 
 _RESAMPLES = 2000
 _trimmed_mean = partial(stats.trim_mean, proportiontocut=0.25)
@@ -60,3 +66,9 @@ def paired_difference(
     reach = float(stats.t.ppf(0.975, len(differences) - 1) * error)
     mean = float(differences.mean())
     return mean, (mean - reach, mean + reach)
+
+
+def difference_text(mean: float, interval: tuple[float, float], digits: int = 2) -> str:
+    """Return a difference and its interval, as tables show them."""
+    low, high = interval
+    return f"{mean:+.{digits}f} [{low:+.{digits}f}, {high:+.{digits}f}]"

@@ -5,9 +5,9 @@ from typing import Any
 
 from benchmarks.comparison import differences_table, draw_panels, scores_of, scores_table
 from benchmarks.controllers import available
-from benchmarks.distillation import distil_cell
+from benchmarks.distillation import distillations
 from benchmarks.finite_difference import experts
-from benchmarks.runner import Benchmark, Cell, Row
+from benchmarks.runner import Cell, Row
 
 __all__ = ["MUJOCO"]
 
@@ -15,9 +15,15 @@ SEEDS = range(5)
 HORIZON = 300
 BUDGETS = (5, 20)
 SOURCES: dict[str, int | str] = {"plain": 0, "probes": 10, "jacobian": "jacobian"}
+# What is the default is left out: other benchmarks' cells are then seen to be the same.
+TRAINERS: dict[str, dict[str, Any]] = {
+    "bc": {},
+    "dagger": {"trainer": "dagger"},
+    "dart": {"trainer": "dart"},
+}
 METHODS = {
-    f"{trainer}, {source}": {"trainer": trainer, "probes": probes}
-    for trainer in ("bc", "dagger", "dart")
+    f"{trainer}, {source}": {**setting, "probes": probes}
+    for trainer, setting in TRAINERS.items()
     for source, probes in SOURCES.items()
 }
 # What probes add to each trainer, and what each trainer adds to probes.
@@ -43,10 +49,10 @@ def cells(quick: bool) -> list[Cell]:
     ]
 
 
-def run(cell: Cell) -> dict[str, Any]:
-    """Distil by the cell's trainer and source, defaults otherwise."""
+def arguments(cell: Cell) -> dict[str, Any]:
+    """Return the cell's trainer and source; the rest are defaults."""
     settings = {"expert": cell["expert"], "episodes": cell["episodes"], "seed": cell["seed"]}
-    return distil_cell({**settings, "horizon": HORIZON, **METHODS[cell["method"]]})
+    return {**settings, "horizon": HORIZON, **METHODS[cell["method"]]}
 
 
 def draw(rows: Sequence[Row]) -> dict[str, bytes]:
@@ -62,4 +68,4 @@ def draw(rows: Sequence[Row]) -> dict[str, bytes]:
     }
 
 
-MUJOCO = Benchmark("mujoco", __doc__ or "", cells, run, draw)
+MUJOCO = distillations("mujoco", __doc__ or "", cells, arguments, draw)

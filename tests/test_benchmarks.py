@@ -12,7 +12,7 @@ from threadpoolctl import threadpool_info
 
 pytest.importorskip("joblib", reason="needs the extra: pip install 'fdtasil[bench]'")
 
-from benchmarks.runner import Benchmark, read_rows, results_of, run
+from benchmarks.runner import Benchmark, known_results, read_rows, results_of, run
 from benchmarks.statistics import interquartile_mean, interval, paired_difference
 
 ROOT = Path(__file__).parent.parent
@@ -155,3 +155,104 @@ def test_methods_side_by_side(name):
     assert "+0.00 [+0.00, +0.00]" in table
     assert all(data.startswith(b"\x89PNG") for file, data in files.items() if file.endswith("png"))
     assert benchmark.draw(rows[:20]) == {}
+
+
+def arguments(cell):
+    return {"tripled": 3 * cell["number"]}
+
+
+def test_benchmarks_share_the_results_of_equal_distillations(tmp_path):
+    """Whatever the cells are called: the arguments say whether two are the same."""
+    ran = []
+
+    def triple(cell):
+        ran.append(cell["number"])
+        return arguments(cell)
+
+    cells = [{"number": number} for number in range(3)]
+    first = Benchmark("first", "", lambda quick: cells, triple, dict, arguments=arguments)
+    run(first, cells[:2], first.results(tmp_path))
+    known = known_results([first, TOY], tmp_path)
+    second = Benchmark("second", "", lambda quick: [], triple, dict, arguments=arguments)
+    renamed = [{"name": "new", **cell} for cell in cells]
+    run(second, renamed, second.results(tmp_path), known=known)
+    assert ran == [0, 1, 2]
+    rows = {row["cell"]["number"]: row for row in read_rows(second.results(tmp_path))}
+    assert [rows[number]["result"]["tripled"] for number in range(3)] == [0, 3, 6]
+    assert [rows[number].get("from") for number in range(3)] == ["first", "first", None]
+    assert all(row["cell"]["name"] == "new" for row in rows.values())
+
+
+def test_the_same_distillation_is_found_in_several_benchmarks():
+    from benchmarks.finite_difference import FINITE_DIFFERENCE
+    from benchmarks.quality import QUALITY
+    from benchmarks.queries import QUERIES
+    from benchmarks.trainers import MUJOCO
+
+    def known(benchmark):
+        return {json.dumps(benchmark.arguments(c), sort_keys=True) for c in benchmark.cells(False)}
+
+    for benchmark in (QUALITY, QUERIES, MUJOCO):
+        assert known(benchmark) & known(FINITE_DIFFERENCE)
+
+
+def test_return_against_questions():
+    """Ten probes cost eleven questions a step here; the rival's return at equal cost is known."""
+    from benchmarks.queries import QUERIES
+
+    def result(cell):
+        factor = int(cell["method"]) + 1 if cell["method"].isdigit() else 1
+        asked = 300 * cell["episodes"] * factor
+        score = 0.1 * np.log(asked) + (0.25 if factor > 1 else 0)  # a quarter above the rivals
+        return {"queries": {"act": asked, "check": 96}, "normalized_return": float(score)}
+
+    rows = [{"cell": cell, "result": result(cell)} for cell in QUERIES.cells(False)]
+    files = QUERIES.draw(rows)
+    assert files["queries.png"].startswith(b"\x89PNG")
+    table = files["queries.md"].decode()
+    expert = rows[0]["cell"]["expert"]
+    line = f"| {expert} | 10 probes | 1 | 3,300 | +0.25 [+0.25, +0.25] | +0.25 [+0.25, +0.25] |"
+    assert line in table
+    assert f"| {expert} | 50 probes | 20 | 306,000 | out of reach | out of reach |" in table
+    assert QUERIES.draw(rows[1:60]) == {}
+
+
+def test_a_student_beside_its_expert_under_disturbances():
+    from benchmarks.disturbances import DISTURBANCES
+    from benchmarks.robustness import ROBUSTNESS
+
+    def result(cell):
+        share = {"plain": 0.5, "10": 0.9, "augmentation": 0.8}[cell["method"]]
+        expert = {"expert_return": 200.0, "student_return": 200 * share}
+        fallen = {"expert_return": 100.0, "student_return": 100 * share}
+        return {name: expert if name == "none" else fallen for name in DISTURBANCES}
+
+    rows = [{"cell": cell, "result": result(cell)} for cell in ROBUSTNESS.cells(False)]
+    files = ROBUSTNESS.draw(rows)
+    assert files["robustness.png"].startswith(b"\x89PNG")
+    table = files["robustness.md"].decode()
+    name = rows[0]["cell"]["expert"]
+    assert f"| {name} | none | 1.00 [1.00, 1.00] | 0.50 [0.50, 0.50] | 0.90 [0.90," in table
+    assert f"| {name} | noise 0.1 | 0.50 [0.50, 0.50] | 0.25 [0.25, 0.25] | 0.45 [0.45," in table
+    assert "| +0.40 [+0.40, +0.40] |" in table
+
+
+@pytest.mark.parametrize("name", ["noise 0.2", "push 1", "mass 1.2", "friction 0.5"])
+def test_equal_seeds_are_disturbed_equally(name):
+    import gymnasium
+
+    from benchmarks.disturbances import DISTURBANCES
+
+    def observations(seed, disturbed):
+        env = gymnasium.make("Walker2d-v5")
+        env = DISTURBANCES[name].wrap(env, np.ones(17)) if disturbed else env
+        first, _ = env.reset(seed=seed)
+        zero = np.zeros(6, np.float32)
+        return np.array([first, *(env.step(zero)[0] for _ in range(60))])
+
+    same = observations(3, True)
+    np.testing.assert_array_equal(same, observations(3, True))
+    usual = observations(3, False)
+    assert np.abs(same - usual).max() > 0.01
+    if name == "push 1":  # nothing before the first push
+        np.testing.assert_array_equal(same[:50], usual[:50])
