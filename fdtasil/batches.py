@@ -6,7 +6,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from fdtasil.demonstrations import Answers, Demonstrations
+from fdtasil.answers import Answers
+from fdtasil.demonstrations import Demonstrations
 from fdtasil.loss import Minibatch
 from fdtasil.probes import Probes
 

@@ -7,10 +7,11 @@ from typing import Any, Literal
 
 import numpy as np
 
-from fdtasil.demonstrations import Statistics, ask_moved
+from fdtasil.answers import ask_moved
 from fdtasil.errors import FdtasilWarning
 from fdtasil.experts import Expert
 from fdtasil.probes import CENTRAL, FORWARD, Probes
+from fdtasil.scales import Statistics
 
 __all__ = ["Calibration", "Ladder", "calibrate", "ladder_for"]
 

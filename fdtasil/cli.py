@@ -13,7 +13,6 @@ import tyro
 
 from fdtasil.calibration import calibrate
 from fdtasil.configuration import check_count
-from fdtasil.demonstrations import statistics
 from fdtasil.distilled import Distilled
 from fdtasil.environments import EnvironmentPool, resolve_horizon
 from fdtasil.errors import FdtasilError, SettingError
@@ -25,6 +24,7 @@ from fdtasil.pipeline import distill, evaluate
 from fdtasil.presets import PRESETS
 from fdtasil.rollouts import follow, rollout
 from fdtasil.sb3 import export_sb3
+from fdtasil.scales import statistics
 from fdtasil.seeding import episode_seeds, generator
 from fdtasil.storage import to_json, write_bytes
 

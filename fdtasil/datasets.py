@@ -9,7 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from fdtasil.demonstrations import Answers, Demonstrations
+from fdtasil.answers import Answers
+from fdtasil.demonstrations import Demonstrations
 from fdtasil.errors import SettingError, StorageError
 from fdtasil.probes import Probes
 

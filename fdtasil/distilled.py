@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from fdtasil.answers import Answers
 from fdtasil.calibration import Calibration
 from fdtasil.datasets import Dataset
-from fdtasil.demonstrations import Answers, Demonstrations
+from fdtasil.demonstrations import Demonstrations
 from fdtasil.errors import SettingError, StorageError
 from fdtasil.evaluation import Evaluation
 from fdtasil.figures import draw_calibration, draw_returns, draw_training

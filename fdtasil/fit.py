@@ -9,8 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from fdtasil.answers import Answers
 from fdtasil.batches import Batches
-from fdtasil.demonstrations import Answers, Demonstrations
+from fdtasil.demonstrations import Demonstrations
 from fdtasil.errors import SettingError
 from fdtasil.fitstate import FitState
 from fdtasil.loss import Minibatch, Weights, taylor_loss

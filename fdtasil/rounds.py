@@ -11,16 +11,11 @@ from typing import Any
 import numpy as np
 import torch
 
+from fdtasil.answers import Answers, ask_probes
 from fdtasil.calibration import Calibration, calibrate
 from fdtasil.configuration import Configuration
 from fdtasil.datasets import Dataset
-from fdtasil.demonstrations import (
-    Answers,
-    Statistics,
-    ask_probes,
-    label,
-    statistics,
-)
+from fdtasil.demonstrations import label
 from fdtasil.environments import EnvironmentPool
 from fdtasil.errors import FdtasilWarning, SettingError
 from fdtasil.evaluation import check_episodes
@@ -33,6 +28,7 @@ from fdtasil.probes import Probes
 from fdtasil.progress import Stages
 from fdtasil.rollouts import Behaviour, Episodes, rollout
 from fdtasil.runfolder import RunFolder
+from fdtasil.scales import Statistics, statistics
 from fdtasil.seeding import episode_seeds, generator, torch_generator
 from fdtasil.storage import to_json
 from fdtasil.student import Student, StudentShape

@@ -7,7 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from fdtasil.demonstrations import Answers, Demonstrations
+from fdtasil.answers import Answers
+from fdtasil.demonstrations import Demonstrations
 from fdtasil.errors import ExpertError, SettingError, shown
 from fdtasil.experts.hub import fetch, is_hub_uri
 from fdtasil.onnx_files import read_model

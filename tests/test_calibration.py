@@ -5,8 +5,8 @@ import pytest
 from conftest import mlp_onnx
 
 from fdtasil.calibration import calibrate
-from fdtasil.demonstrations import statistics
 from fdtasil.experts import load_expert
+from fdtasil.scales import statistics
 
 STATES = np.random.default_rng(0).standard_normal((200, 5)).astype(np.float32)
 NOISE = np.random.default_rng(1)

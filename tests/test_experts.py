@@ -10,11 +10,12 @@ import torch
 from conftest import GAIN, mlp_onnx
 from onnx import TensorProto
 
-from fdtasil.demonstrations import ask_probes, statistics
+from fdtasil.answers import ask_probes
 from fdtasil.errors import ExpertError, FdtasilWarning
 from fdtasil.experts import load_expert
 from fdtasil.presets import PRESETS
 from fdtasil.probes import Probes
+from fdtasil.scales import statistics
 
 
 @pytest.fixture

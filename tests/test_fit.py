@@ -7,14 +7,16 @@ import numpy as np
 import pytest
 import torch
 
+from fdtasil.answers import Answers, ask_probes
 from fdtasil.batches import Batches
 from fdtasil.compute import pick_device, torch_settings
-from fdtasil.demonstrations import Answers, Demonstrations, ask_probes, statistics
+from fdtasil.demonstrations import Demonstrations
 from fdtasil.errors import FdtasilWarning, FitError, SettingError
 from fdtasil.experts import load_expert
 from fdtasil.fit import Hooks, fit
 from fdtasil.presets import PRESETS
 from fdtasil.probes import Probes
+from fdtasil.scales import statistics
 from fdtasil.seeding import torch_generator
 from fdtasil.student import Student, StudentShape
 
@@ -247,7 +249,7 @@ def test_a_gpu_beyond_the_last_one_is_refused(monkeypatch):
 
 @pytest.mark.fault(91)
 def test_answers_that_take_much_memory_are_announced_before_they_are_asked(monkeypatch):
-    monkeypatch.setattr("fdtasil.demonstrations._MUCH", 1000)
+    monkeypatch.setattr("fdtasil.answers._MUCH", 1000)
     _, _, ask = linear_task(states=50, spec="5")
     with pytest.warns(FdtasilWarning, match=r"50 states x 5 probes, take 0\.0 GiB"):
         ask(0)

@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 import torch
 
-from fdtasil.demonstrations import ask_probes, statistics
+from fdtasil.answers import ask_probes
 from fdtasil.experts import load_expert
 from fdtasil.loss import Minibatch, Weights, taylor_loss
 from fdtasil.presets import PRESETS
 from fdtasil.probes import Probes
+from fdtasil.scales import statistics
 from fdtasil.student import Student, StudentShape
 
 

@@ -11,11 +11,12 @@ from gymnasium.spaces import Box
 from toy_environments import Integrator
 
 import fdtasil
-from fdtasil.demonstrations import ask_probes, statistics
+from fdtasil.answers import ask_probes
 from fdtasil.errors import ExpertError, FdtasilWarning, SettingError
 from fdtasil.experts import load_expert
 from fdtasil.presets import PRESETS
 from fdtasil.probes import Probes
+from fdtasil.scales import statistics
 
 BOX = Box(-np.inf, np.inf, (5,), np.float64)
 

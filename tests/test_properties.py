@@ -10,13 +10,15 @@ from conftest import GAIN, mlp_onnx
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fdtasil.answers import Answers, ask_probes
 from fdtasil.calibration import Calibration, Ladder, calibrate
 from fdtasil.datasets import Dataset
-from fdtasil.demonstrations import Answers, Demonstrations, ask_probes, statistics
+from fdtasil.demonstrations import Demonstrations
 from fdtasil.experts import load_expert
 from fdtasil.fitstate import FitState
 from fdtasil.presets import PRESETS
 from fdtasil.probes import CENTRAL, DIRECTIONS, EXACT, FORWARD, LABELS, OrthogonalFrames, Probes
+from fdtasil.scales import statistics
 from fdtasil.seeding import torch_generator
 from fdtasil.storage import sha256, verify, write_folder
 from fdtasil.student import ACTIVATIONS, Student, StudentShape
