@@ -1,41 +1,39 @@
 """distill(): the whole story, from an expert and an environment to a student."""
 
 import time
-import warnings
 from pathlib import Path
 
-import numpy as np
 import torch
 
 from fdtasil.compute import pick_device, torch_settings
-from fdtasil.configuration import GATE_STATES, Configuration, check_count
+from fdtasil.configuration import Configuration, check_count
 from fdtasil.datasets import DatasetLike, load_dataset
 from fdtasil.distilled import Distilled
 from fdtasil.environments import EnvironmentLike, EnvironmentPool, resolve_horizon
-from fdtasil.errors import FdtasilWarning
-from fdtasil.evaluation import Evaluation, check_episodes, compare
+from fdtasil.evaluation import Evaluation
 from fdtasil.events import Callback, Event, tell_all
-from fdtasil.experts import Expert, ExpertLike, check_expert, load_expert
+from fdtasil.examination import examine, judge
+from fdtasil.experts import ExpertLike, load_expert
 from fdtasil.interrupts import heard_interrupts
 from fdtasil.presets import preset_of
 from fdtasil.probes import Probes
 from fdtasil.progress import Stages
 from fdtasil.report import noted_warnings, report_of, versions
-from fdtasil.rollouts import Episodes, Policy, first_observations, follow, rollout
 from fdtasil.rounds import Rounds
 from fdtasil.runfolder import open_run_folder
+from fdtasil.runstate import RunState
 from fdtasil.sb3 import Trust
 from fdtasil.seeding import check_seed, episode_seeds
 from fdtasil.storage import sha256
 from fdtasil.student import check_shape
 from fdtasil.subject import Subject, open_subject, source_of, trainer_for
 from fdtasil.trainers import Trainer
+from fdtasil.training import Training
 from fdtasil.views import StudentObservation, View, columns_of, describe_view
 
 __all__ = ["distill", "evaluate"]
 
 DEFAULT_PROBES = 10
-_LONG = 600.0  # seconds of questions that are announced
 
 
 def distill(
@@ -219,19 +217,10 @@ def distill(
         ):
             if folder and kept.finished and resume is not None:
                 return Distilled.load(folder, student_obs)
-            rounds = Rounds(
-                run,
-                subject.expert,
-                subject.pool,
-                student_obs,
-                place,
-                Stages(progress),
-                kept,
-                interrupts,
-                tell_all(callback, log_formats, folder),
-                given,
-            )
-            result = _go(rounds, subject, notes, force=force)
+            state = RunState(run, subject.expert, student_obs, kept, dataset=given)
+            callbacks = tell_all(callback, log_formats, folder)
+            training = Training(state, place, Stages(progress), interrupts, callbacks)
+            result = _go(state, subject, training, notes, force=force)
             if folder:
                 result.save(folder)
                 kept.close()
@@ -289,99 +278,44 @@ def evaluate(
         black_box = load_expert(expert, n, m, output=output, trust=trust)
         length = resolve_horizon(horizon, pool)
         starts = episode_seeds(seed, "evaluation", 0, check_count("episodes", episodes))
-        theirs = _gate(black_box, pool, starts, length, stages, force=force)
+        theirs = examine(black_box, pool, starts, length, stages, force=force)
         seen = columns_of(policy) if student_obs is None else student_obs
         view = View.of(seen, theirs.observations[theirs.valid][:256])
         student = load_expert(policy, view.size, m)
         answer = view.policy(student.policy("evaluate"))
-        return _compare(answer, black_box, theirs, pool, length, seed, stages)
+        return judge(answer, black_box, theirs, pool, length, seed, stages)
 
 
-def _go(rounds: Rounds, subject: Subject, notes: list[str], *, force: bool) -> Distilled:
+def _go(
+    state: RunState, subject: Subject, training: Training, notes: list[str], *, force: bool
+) -> Distilled:
     """Gate, rounds, comparison, report."""
-    run, stages, expert, pool = rounds.run, rounds.stages, subject.expert, subject.pool
-    with torch_settings(rounds.device) as precision:
+    run, stages, expert, pool = state.run, training.stages, subject.expert, subject.pool
+    with torch_settings(training.device) as precision:
         theirs = None
         if expert is not None and pool is not None:
             starts = episode_seeds(run.seed, "evaluation", 0, run.evaluation_episodes)
             rows = sum(run.predicted_queries().values())
-            theirs = _gate(expert, pool, starts, run.horizon, stages, force=force, rows=rows)
+            theirs = examine(expert, pool, starts, run.horizon, stages, force=force, rows=rows)
         started = time.perf_counter()
-        rounds.all()
-        seconds, student, evaluation = time.perf_counter() - started, rounds.trained, None
+        Rounds(state, pool, training).all()
+        seconds, student, evaluation = time.perf_counter() - started, state.trained, None
         if expert is not None and pool is not None and theirs is not None:
-            policy = rounds.view.policy(student.act)
-            evaluation = _compare(policy, expert, theirs, pool, run.horizon, run.seed, stages)
-            last = rounds.history[-1]
-            event = Event(
-                "evaluation", int(last["round"]), rounds.steps, last, student, evaluation
-            )
-            rounds.callback(event)
+            policy = state.view.policy(student.act)
+            evaluation = judge(policy, expert, theirs, pool, run.horizon, run.seed, stages)
+            last = state.history[-1]
+            about = int(last["round"]), state.steps, last
+            training.callback(Event("evaluation", *about, student, evaluation))
     report = report_of(
         run,
         evaluation,
-        rounds,
+        state,
         train_seconds=seconds,
         matmul_precision=precision,
         notes=notes,
     )
     settings = {**run.to_json(), "versions": report["versions"]}
-    history, queries = rounds.history, report["queries"]
+    history, queries = state.history, report["queries"]
     return Distilled(
-        student, evaluation, history, queries, settings, report, rounds.data, rounds.view
+        student, evaluation, history, queries, settings, report, state.data, state.view
     )
-
-
-def _gate(
-    expert: Expert,
-    pool: EnvironmentPool,
-    starts: list[int],
-    horizon: int,
-    stages: Stages,
-    *,
-    force: bool,
-    rows: int = 0,
-) -> Episodes:
-    """Check the expert on first states, let it act, check it on the states it visited.
-
-    Before it acts it is known how fast it is, and so how long `rows` questions may take.
-
-    Returns:
-        Its episodes from the evaluation's starts, which the student is compared with later.
-    """
-    first = first_observations(pool, [starts[e % len(starts)] for e in range(GATE_STATES)])
-    _announce(check_expert(expert, first, pool.boxes, force=force), rows)
-    with stages.stage("expert", len(starts) * horizon, "step") as move:
-        behaviour = follow(expert.policy("evaluate"))
-        episodes = rollout(behaviour, pool, starts, horizon, on_step=move)
-    check_episodes(episodes, pool.name)
-    visited = episodes.observations[episodes.valid]
-    spread = np.linspace(0, len(visited) - 1, GATE_STATES).astype(int)
-    check_expert(expert, visited[spread], pool.boxes, force=force)
-    return episodes
-
-
-def _announce(seconds: float, rows: int) -> None:
-    """Warn of questions that take long, before they are asked."""
-    if seconds * rows > _LONG:
-        warnings.warn(
-            f"the expert takes {1000 * seconds:.3g} ms a row, so the {rows:,} rows that this run "
-            f"may ask take up to {seconds * rows / 3600:.1f} h: lower probes, episodes, horizon "
-            "or evaluation_episodes, or let load_expert(..., workers=) answer side by side",
-            FdtasilWarning,
-            stacklevel=5,
-        )
-
-
-def _compare(
-    student: Policy,
-    expert: Expert,
-    expert_episodes: Episodes,
-    pool: EnvironmentPool,
-    horizon: int,
-    seed: int,
-    stages: Stages,
-) -> Evaluation:
-    total = len(expert_episodes.seeds) * horizon
-    with stages.stage("evaluation", total, "step") as move:
-        return compare(student, expert, expert_episodes, pool, horizon, seed, move)

@@ -12,7 +12,7 @@ from typing import Any
 from fdtasil.configuration import Configuration
 from fdtasil.errors import FdtasilWarning
 from fdtasil.evaluation import Evaluation
-from fdtasil.rounds import Rounds
+from fdtasil.runstate import RunState
 
 __all__ = ["noted_warnings", "report_of", "versions"]
 
@@ -27,7 +27,7 @@ def versions() -> dict[str, str]:
 def report_of(
     configuration: Configuration,
     evaluation: Evaluation | None,
-    rounds: Rounds,
+    state: RunState,
     *,
     train_seconds: float,
     matmul_precision: str,
@@ -38,15 +38,15 @@ def report_of(
     Args:
         configuration: The run's.
         evaluation: Student against expert, or None where they could not be compared.
-        rounds: After the last round.
+        state: After the last round.
         train_seconds: Wall-clock seconds of collecting, probing and training.
         matmul_precision: torch's float32 matrix-product precision in force.
         notes: Warnings on the way.
     """
     plain = configuration.to_json()
-    source, calibration = rounds.source, rounds.calibration
+    source, calibration = state.source, state.calibration
     predicted = replace(configuration, probes=source).predicted_queries()
-    asked = rounds.expert.queries if rounds.expert else Counter[str]()
+    asked = state.expert.queries if state.expert else Counter[str]()
     return {
         "expert": {
             "path": configuration.expert,
@@ -62,12 +62,12 @@ def report_of(
         "queries": {name: asked[name] for name in predicted},
         "predicted_queries": predicted,
         "rows_asked_again_after_resuming": asked["again"],
-        "states": len(rounds.data.demonstrations),
-        "frozen_coordinates": int((~rounds.scales.live).sum()),
-        "clipped_actions": rounds.counts["clipped_actions"],
-        "physics_resets": rounds.counts["physics_resets"],
-        "terminated_episodes": rounds.counts["terminated_episodes"],
-        "steps": rounds.steps,
+        "states": len(state.data.demonstrations),
+        "frozen_coordinates": int((~state.scales.live).sum()),
+        "clipped_actions": state.counts["clipped_actions"],
+        "physics_resets": state.counts["physics_resets"],
+        "terminated_episodes": state.counts["terminated_episodes"],
+        "steps": state.steps,
         "train_seconds": round(train_seconds, 2),
         "matmul_precision": matmul_precision,
         "warnings": notes,

@@ -64,7 +64,7 @@ def no_training(monkeypatch):
     def never(*arguments, **named):
         raise AssertionError("training began")
 
-    monkeypatch.setattr("fdtasil.rounds.fit", never)
+    monkeypatch.setattr("fdtasil.training.fit", never)
 
 
 def refused(environment, linear, kind=EnvironmentFault, **changes):
@@ -480,9 +480,9 @@ import ctypes, os, sys, time
 import torch
 torch.set_num_threads(1)
 import fdtasil
-from fdtasil import rounds
+from fdtasil import training
 from test_environment_faults import Odd
-rounds.CHECKPOINT_SECONDS = 0.0
+training.CHECKPOINT_SECONDS = 0.0
 folder, how = sys.argv[1:]
 steps = []
 

@@ -37,7 +37,7 @@ def test_every_fault_is_found_before_training(fault, monkeypatch):
     def never(*arguments, **named):
         raise AssertionError("training began")
 
-    monkeypatch.setattr("fdtasil.rounds.fit", never)
+    monkeypatch.setattr("fdtasil.training.fit", never)
     expert, found = FAULTS[fault]
     with pytest.raises(ExpertError, match=found) as error:
         fdtasil.distill(expert, TOY, 3, **QUICK)

@@ -264,7 +264,7 @@ def test_probes_are_not_clipped_to_the_bounds_of_the_observations(linear):
 
 @pytest.mark.fault(93)
 def test_an_expert_that_refuses_what_lies_outside_is_told_why_before_training(linear, monkeypatch):
-    monkeypatch.setattr("fdtasil.rounds.fit", never)
+    monkeypatch.setattr("fdtasil.training.fit", never)
 
     def strict(rows):
         if np.abs(rows[:, :4]).max() > 1.2:

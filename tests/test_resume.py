@@ -6,7 +6,7 @@ import pytest
 from conftest import QUICK, TOY, mlp_onnx
 
 import fdtasil
-from fdtasil import rounds
+from fdtasil import training
 from fdtasil.errors import FdtasilWarning, SettingError
 
 FILES = (
@@ -25,7 +25,7 @@ class Stop(Exception):
 
 @pytest.fixture(autouse=True)
 def checkpoint_at_every_epoch(monkeypatch):
-    monkeypatch.setattr(rounds, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(training, "CHECKPOINT_SECONDS", 0.0)
 
 
 @pytest.fixture(scope="module")

@@ -1,0 +1,86 @@
+"""What an expert goes through before it teaches, and a student after it has learnt."""
+
+import warnings
+
+import numpy as np
+
+from fdtasil.configuration import GATE_STATES
+from fdtasil.environments import EnvironmentPool
+from fdtasil.errors import FdtasilWarning
+from fdtasil.evaluation import Evaluation, check_episodes, compare
+from fdtasil.experts import Expert, check_expert
+from fdtasil.progress import Stages
+from fdtasil.rollouts import Episodes, Policy, first_observations, follow, rollout
+
+__all__ = ["examine", "judge"]
+
+_LONG = 600.0  # seconds of questions that are announced
+
+
+def examine(
+    expert: Expert,
+    pool: EnvironmentPool,
+    starts: list[int],
+    horizon: int,
+    stages: Stages,
+    *,
+    force: bool,
+    rows: int = 0,
+) -> Episodes:
+    """Check an expert on first states, let it act, and check it on the states that it visited.
+
+    Before it acts it is known how fast it is, and so how long its questions may take.
+
+    Args:
+        expert: Counts what it is asked under "check" and "evaluate".
+        pool: The environment.
+        starts: Seeds of the episodes.
+        horizon: T, steps after which an episode is cut.
+        stages: Progress bars.
+        force: Go on with a warning where it fails a check but answers.
+        rows: That the whole run may ask for; a long wait for them is announced.
+
+    Returns:
+        Its episodes, which a student is compared with later.
+
+    Raises:
+        ExpertError: If it fails a check.
+        EnvironmentFault: If nothing can be learnt from its episodes.
+    """
+    first = first_observations(pool, [starts[e % len(starts)] for e in range(GATE_STATES)])
+    _announce(check_expert(expert, first, pool.boxes, force=force), rows)
+    with stages.stage("expert", len(starts) * horizon, "step") as move:
+        behaviour = follow(expert.policy("evaluate"))
+        episodes = rollout(behaviour, pool, starts, horizon, on_step=move)
+    check_episodes(episodes, pool.name)
+    visited = episodes.observations[episodes.valid]
+    spread = np.linspace(0, len(visited) - 1, GATE_STATES).astype(int)
+    check_expert(expert, visited[spread], pool.boxes, force=force)
+    return episodes
+
+
+def _announce(seconds: float, rows: int) -> None:
+    """Warn of questions that take long, before they are asked."""
+    if seconds * rows > _LONG:
+        warnings.warn(
+            f"the expert takes {1000 * seconds:.3g} ms a row, so the {rows:,} rows that this run "
+            f"may ask take up to {seconds * rows / 3600:.1f} h: lower probes, episodes, horizon "
+            "or evaluation_episodes, or let load_expert(..., workers=) answer side by side",
+            FdtasilWarning,
+            stacklevel=5,
+        )
+
+
+def judge(
+    student: Policy,
+    expert: Expert,
+    expert_episodes: Episodes,
+    pool: EnvironmentPool,
+    horizon: int,
+    seed: int,
+    stages: Stages,
+) -> Evaluation:
+    """Compare a student with the expert's episodes, under a progress bar; see `compare`."""
+    total = len(expert_episodes.seeds) * horizon
+    with stages.stage("evaluation", total, "step") as move:
+        return compare(student, expert, expert_episodes, pool, horizon, seed, move)

@@ -1,0 +1,206 @@
+"""What grows from round to round of a run: how it is kept, and taken up again."""
+
+import json
+from collections import Counter
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from fdtasil.answers import Answers, ask_probes
+from fdtasil.calibration import Calibration, calibrate
+from fdtasil.configuration import Configuration
+from fdtasil.datasets import Dataset
+from fdtasil.errors import SettingError
+from fdtasil.experts import Expert
+from fdtasil.probes import Probes
+from fdtasil.rollouts import Episodes
+from fdtasil.runfolder import RunFolder
+from fdtasil.scales import Statistics, statistics
+from fdtasil.seeding import generator
+from fdtasil.storage import to_json
+from fdtasil.student import Student
+from fdtasil.views import StudentObservation, View
+
+__all__ = ["RunState"]
+
+
+@dataclass
+class RunState:
+    """What grows from round to round.
+
+    Attributes:
+        run: The configuration.
+        expert: Who labels and answers probes; None where nothing has to be asked.
+        student_obs: What the student sees; None for everything.
+        folder: Where every stage is kept.
+        dataset: All labelled states so far and the answers around them.
+        student: The last round's.
+        history: Entries of all rounds.
+        steps: Gradient steps of all rounds.
+        episodes: Number of episodes recorded so far.
+        counts: Clipped actions, physics resets and falls of the recorded episodes.
+        calibration: What was found about the expert in the first round, or None.
+        source: The derivative source, with what the calibration found filled in.
+        again: Rows asked before a checkpoint was taken up, which the interrupted run has asked
+            and counted too; None in a run that was not interrupted.
+    """
+
+    run: Configuration
+    expert: Expert | None
+    student_obs: StudentObservation | None
+    folder: RunFolder
+    dataset: Dataset | None = None
+    student: Student | None = None
+    history: list[dict[str, float]] = field(default_factory=list)
+    steps: int = 0
+    episodes: int = 0
+    counts: Counter[str] = field(default_factory=Counter)
+    again: int | None = None
+    calibration: Calibration | None = None
+    source: Probes | None = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.source = self.run.probes
+
+    @property
+    def data(self) -> Dataset:
+        """The dataset; the first round has made it, or it was given."""
+        assert self.dataset is not None
+        return self.dataset
+
+    @property
+    def trained(self) -> Student:
+        """The last round's student."""
+        assert self.student is not None, "every run has a round"
+        return self.student
+
+    @property
+    def view(self) -> View:
+        """What the student sees."""
+        states = self.data.demonstrations
+        return View.of(self.student_obs, states.observations[states.round == 0][:256])
+
+    @property
+    def scales(self) -> Statistics:
+        """Scales of all states so far: the first episode may be a fall of three steps."""
+        return statistics(self.data.demonstrations.observations, self.view.seen)
+
+    def count(self, recorded: Episodes) -> None:
+        """Count newly recorded episodes, and what happened in them."""
+        self.episodes += len(recorded.valid)
+        self.counts["clipped_actions"] += recorded.clipped_actions
+        self.counts["physics_resets"] += int(recorded.physics_resets.sum())
+        self.counts["terminated_episodes"] += int(recorded.terminated.sum())
+
+    def calibrate(self) -> None:
+        """Find what the source leaves open, once, on the states of the first round."""
+        run, expert = self.run, self.expert
+        if not run.calibrated or self.calibration is not None or expert is None:
+            return
+        assert run.probes is not None
+        found = calibrate(
+            expert,
+            self.data.demonstrations.observations,
+            self.scales,
+            generator(run.seed, "calibration"),
+            run.usual_radius,
+            run.ladder,
+        )
+        self.calibration, self.source = found, found.complete(run.probes)
+
+    def ask(self, observations: np.ndarray, *path: int) -> Answers:
+        """Ask the probes around states, along the directions of a named stream.
+
+        Raises:
+            SettingError: If there is nobody to ask, or the budget does not allow it.
+            ExpertError: As `ask_probes`.
+        """
+        probes, expert = self.source, self.expert
+        assert probes is not None
+        if expert is None:
+            raise SettingError(
+                f"probes={probes.describe()!r} without an expert to ask",
+                "an expert, or demonstrations with stored answers",
+                "pass the expert, or probes=0 for plain behaviour cloning",
+            )
+        scales = self.scales
+        self._check_budget(
+            probes.queries(len(observations), int(scales.probed(probes.space).sum()), 1)
+        )
+        random = generator(self.run.seed, "probes", *path)
+        return ask_probes(expert, observations, probes, scales, random, self.run.order)
+
+    def _check_budget(self, rows: int) -> None:
+        """Refuse to ask beyond the budget: early ends make a resampling source ask more often."""
+        asked, most = sum(self.ledger().values()), self.run.max_queries
+        if most is not None and asked + rows > most:
+            raise SettingError(
+                f"{asked:,} rows are asked, and {rows:,} more are due",
+                f"at most max_queries={most:,}",
+                "raise max_queries, or leave out resample",
+            )
+
+    def ledger(self) -> dict[str, int]:
+        """Return the rows that the expert has answered so far, by purpose."""
+        return dict(self.expert.queries) if self.expert else {}
+
+    def restore_ledger(self, queries: dict[str, int]) -> None:
+        """Take the ledger of the interrupted run; what this one asked before counts as again."""
+        if self.expert is None:
+            return
+        if self.again is None:
+            self.again = sum(self.expert.queries.values())
+        self.expert.queries.clear()
+        self.expert.queries.update(queries)
+        self.expert.queries["again"] += self.again
+
+    def keep_collected(self, round_: int) -> None:
+        """Keep what a round has recorded and asked."""
+        about = {
+            "episodes": self.episodes,
+            "counts": self.counts,
+            "queries": self.ledger(),
+            "calibration": self.calibration.to_json() if self.calibration else None,
+        }
+        self.folder.save(
+            round_,
+            "collected",
+            0,
+            lambda: {"demonstrations.npz": self.data.to_bytes(), "state.json": to_json(about)},
+        )
+
+    def restore_collected(self, round_: int) -> bool:
+        """Take up what a round of the interrupted run kept; return whether there was any."""
+        files = self.folder.load(round_, "collected")
+        if files is None:
+            return False
+        state: dict[str, Any] = json.loads(files["state.json"])
+        self.dataset = Dataset.from_bytes(files["demonstrations.npz"])
+        self.episodes, self.counts = state["episodes"], Counter(state["counts"])
+        self.restore_ledger(state["queries"])
+        if state["calibration"] and self.calibration is None and self.run.probes is not None:
+            self.calibration = Calibration.from_json(state["calibration"])
+            self.source = self.calibration.complete(self.run.probes)
+        return True
+
+    def keep_trained(self, round_: int) -> None:
+        """Keep a round's student."""
+        about = {"history": self.history, "steps": self.steps, "queries": self.ledger()}
+        self.folder.save(
+            round_,
+            "trained",
+            0,
+            lambda: {"student.safetensors": self.trained.to_bytes(), "state.json": to_json(about)},
+        )
+
+    def restore_trained(self, round_: int) -> bool:
+        """Take up a round's student; return whether there was one."""
+        files = self.folder.load(round_, "trained")
+        if files is None:
+            return False
+        state: dict[str, Any] = json.loads(files["state.json"])
+        self.student = Student.from_bytes(files["student.safetensors"])
+        self.history, self.steps = state["history"], state["steps"]
+        self.restore_ledger(state["queries"])
+        return True
