@@ -1,0 +1,162 @@
+"""Files of the Hugging Face hub, by `hf://org/repo/file[@revision]`, pinned to their commit.
+
+huggingface_hub is imported inside the functions: it is an extra, and `import fdtasil` stays light.
+"""
+
+import fnmatch
+import hashlib
+import os
+from collections.abc import Collection
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
+from typing import TYPE_CHECKING
+
+from fdtasil.errors import ExpertError, first_line
+from fdtasil.experts.hub.errors import no_file
+from fdtasil.experts.hub.place import COMMIT, Place, is_hub_uri, parse
+from fdtasil.experts.hub.requests import download, look_up
+from fdtasil.onnx_files import side_files
+from fdtasil.storage import sha256, stays_inside, write_bytes
+
+if TYPE_CHECKING:
+    from huggingface_hub.hf_api import RepoSibling
+
+__all__ = ["HubFile", "fetch", "is_hub_uri"]
+
+
+@dataclass(frozen=True)
+class HubFile:
+    """A file of the hub that is on this machine.
+
+    Attributes:
+        path: A plain file; the side files that an ONNX model declares are where it says.
+        uri: What was fetched, with the commit as its revision.
+    """
+
+    path: Path
+    uri: str
+
+
+def fetch(uri: str | Path) -> HubFile:
+    """Fetch a file of the hub with the side files that it declares, unless they are here already.
+
+    What is here under a commit's name needs no network. Nothing else of the repository is fetched,
+    and no code of it is run. A token is sent where huggingface_hub is configured with one.
+
+    Args:
+        uri: `hf://org/repo/file`, with `@` and a branch, tag or commit after it if not the newest.
+
+    Returns:
+        The file, and its URI with the commit that the revision stands for now.
+
+    Raises:
+        ExpertError: If there is no such file that the user may read, or no hub that answers
+            within seconds.
+        StorageError: If the file can't be written.
+
+    Example::
+
+        walker = fetch("hf://org/repo/walker.onnx")
+        print(walker.uri)  # hf://org/repo/walker.onnx@<commit>
+    """
+    place = parse(str(uri))
+    _check_library()
+    if not COMMIT.fullmatch(place.revision or ""):
+        place, _ = look_up(place)
+    path = _stored(place)
+    for name in _declared(path):
+        file = str(PurePosixPath(place.file).parent / name)
+        _stored(replace(place, file=file))
+    return HubFile(path, str(place))
+
+
+def _check_library() -> None:
+    try:
+        import huggingface_hub  # noqa: F401
+    except Exception as error:  # it also raises where its variables have odd values
+        raise ExpertError(
+            f"huggingface_hub can't be imported: {first_line(error)}",
+            "huggingface_hub, for experts by hf://",
+            'pip install "fdtasil[hub]", or download the file and name its path',
+        ) from error
+
+
+def _declared(path: Path) -> list[str]:
+    """Return the side files that a model declares beside or below itself.
+
+    Other names are left to `read_model`, which refuses them, and so is what is no model.
+    """
+    if path.suffix == ".zip":
+        return []
+    return sorted(name for name in side_files(path.read_bytes()) if stays_inside(name))
+
+
+def _stored(place: Place) -> Path:
+    """Return the plain file that holds a file of a commit, after fetching it if need be.
+
+    The hub's own cache keeps links into a folder of blobs, without the files' names: a model
+    would not find its side files there, and `read_model` rightly refuses links. So plain files
+    are kept, in the part of the cache that huggingface_hub has for other libraries.
+    """
+    path = _folder(place) / place.file
+    if not os.path.isfile(path):
+        place, files = look_up(place)
+        if files and place.file not in files:
+            raise no_file(place, sorted(files))
+        check_statistics(place, files)
+        data = download(place)
+        check_whole(place, data, files.get(place.file))
+        write_bytes(path, data)
+    return path
+
+
+def _folder(place: Place) -> Path:
+    from huggingface_hub import cached_assets_path
+
+    # The variable is read at the import of huggingface_hub as well, which may be long ago.
+    root = os.environ.get("HF_ASSETS_CACHE")
+    try:
+        return cached_assets_path("fdtasil", place.repo, place.revision or "", assets_dir=root)
+    except (OSError, ValueError) as error:
+        raise ExpertError(
+            f"there is no room for files of the hub: {first_line(error)}",
+            "a cache folder that can be written",
+            "set HF_HOME or HF_ASSETS_CACHE to one",
+        ) from error
+
+
+def check_statistics(place: Place, files: "dict[str, RepoSibling]") -> None:
+    """Refuse to leave out statistics that `read_agent` would find beside a zip on disk."""
+    agent = PurePosixPath(place.file)
+    found = [name for name in sorted(files) if _normalises(PurePosixPath(name), agent, files)]
+    if agent.suffix == ".zip" and found:
+        raise ExpertError(
+            f"{found[0]!r} lies beside {place} and looks like its observation statistics",
+            "an agent without statistics",
+            "download both; `fdtasil export-sb3 --vecnormalize` makes one ONNX file of them",
+        )
+
+
+def _normalises(path: PurePosixPath, agent: PurePosixPath, files: Collection[str]) -> bool:
+    if path.parent == agent.parent:
+        return fnmatch.fnmatchcase(path.name, "*vec*norm*.pkl")
+    # In a folder below, as rl-zoo has it: another agent's are none of this one's business.
+    own = path.parent.name == agent.stem or str(path.parent / "config.yml") in files
+    return path.parent.parent == agent.parent and path.name == "vecnormalize.pkl" and own
+
+
+def check_whole(place: Place, data: bytes, described: "RepoSibling | None") -> None:
+    """Refuse what a proxy or a broken connection made of a file: it would be kept for ever."""
+    expected, found = None, None
+    if described is not None and described.lfs is not None:
+        expected, found = described.lfs.sha256, sha256(data)
+    elif described is not None:
+        blob = b"blob %d\0" % len(data) + data  # how git names the content of a file
+        expected = described.blob_id
+        found = hashlib.sha1(blob, usedforsecurity=False).hexdigest()
+    if expected is not None and expected != found:
+        raise ExpertError(
+            f"{place} arrived with {len(data):,} bytes and the hash {found}",
+            f"the hash {expected} that the hub names",
+            "try again; if it stays so, something between here and the hub changes files",
+        )

@@ -1,0 +1,63 @@
+"""`hf://org/repo/file[@revision]`: how a file of the Hugging Face hub is named."""
+
+import re
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import TypeGuard
+
+from fdtasil.errors import ExpertError
+from fdtasil.storage import stays_inside
+
+__all__ = ["COMMIT", "Place", "is_hub_uri", "malformed", "parse"]
+
+_SCHEME = "hf:"
+# The hub's own names for other kinds of repositories come first in their URIs.
+_URI = re.compile(
+    r"hf://(?!(?:models|datasets|spaces|kernels|buckets)/)"
+    r"(?P<repo>[\w.-]+/[\w.-]+)/(?P<file>[^@]+)(?:@(?P<revision>[^@\s]+))?",
+    re.ASCII,
+)
+COMMIT = re.compile(r"[0-9a-f]{40}")
+
+
+@dataclass(frozen=True)
+class Place:
+    """A file of a model repository; the revision None is the newest of the default branch."""
+
+    repo: str
+    file: str
+    revision: str | None
+
+    def __str__(self) -> str:
+        return f"hf://{self.repo}/{self.file}" + (f"@{self.revision}" if self.revision else "")
+
+
+def is_hub_uri(source: object) -> TypeGuard[str | Path]:
+    """Whether an expert is named by its place on the hub, rightly spelt or not.
+
+    Example:
+        >>> is_hub_uri("hf://org/repo/walker.onnx"), is_hub_uri("walker.onnx")
+        (True, False)
+    """
+    return isinstance(source, (str, Path)) and str(source).startswith(_SCHEME)
+
+
+def parse(text: str) -> Place:
+    """Read a URI.
+
+    Raises:
+        ExpertError: If it names no file of a model repository.
+    """
+    found = _URI.fullmatch(text)
+    if not found or not stays_inside(found["file"]):
+        raise malformed(text)
+    return Place(found["repo"], str(PurePosixPath(found["file"])), found["revision"])
+
+
+def malformed(text: str) -> ExpertError:
+    """Return the error of a URI that can't be read."""
+    return ExpertError(
+        f"{text!r} names no file of the hub",
+        "hf://org/repo/file or hf://org/repo/file@revision of a model repository",
+        "write it like that, as text (a Path drops a slash)",
+    )

@@ -1,0 +1,100 @@
+"""Slow experts, asked by several processes or threads at once.
+
+Why not `concurrent.futures.ProcessPoolExecutor`: its workers import the caller's `__main__`, so a
+script without a guard would run itself again in each of them; it can't end one hung worker; and
+when one dies it says neither which nor how.
+"""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+from fdtasil.errors import ExpertError, SettingError
+from fdtasil.experts.expert import Answer, Expert
+from fdtasil.experts.workers.handle import WorkerProcess
+from fdtasil.experts.workers.pool import WorkerPool
+
+__all__ = ["check_workers", "with_processes", "with_threads"]
+
+# Rows that a worker is handed at once. A fixed number: which rows are asked together must not
+# depend on how many workers there are, since the last bits of an answer may depend on it.
+BATCH = 8
+
+
+def check_workers(workers: int, threads: bool, timeout: float | None, remote: bool) -> None:
+    """Check how an expert is to be asked.
+
+    Args:
+        workers: How many processes or threads.
+        threads: Whether they are threads.
+        timeout: Seconds for a batch, or None.
+        remote: Whether the expert keeps the time itself, as those behind HTTP do.
+
+    Raises:
+        SettingError: If the arguments don't go together.
+    """
+    if isinstance(workers, bool) or not isinstance(workers, int) or workers < 0:
+        raise SettingError(f"workers={workers!r}", "a number of at least 0", "write workers=2")
+    if threads and not workers:
+        raise SettingError(
+            "threads=True with workers=0", "a number of threads", "write workers=2, threads=True"
+        )
+    if timeout is None:
+        return
+    if isinstance(timeout, bool) or not 0 < timeout < float("inf"):
+        raise SettingError(f"timeout={timeout!r}", "a number of seconds", "write timeout=60")
+    if not remote and (threads or not workers):
+        raise SettingError(
+            f"timeout={timeout:g} without processes",
+            "an expert in a process of its own: only that can be ended while it hangs",
+            "write workers=1, or leave timeout= out",
+        )
+
+
+def with_threads(expert: Expert, workers: int) -> Expert:
+    """Return the expert, asked by so many threads of this process."""
+    askers = [_Thread(expert.answer) for _ in range(workers)]
+    return replace(expert, workers=WorkerPool(askers))
+
+
+def with_processes(
+    expert: Expert, opener: Callable[[], Answer] | None, workers: int, timeout: float | None
+) -> Expert:
+    """Return the expert, asked by processes that each hold a copy of it.
+
+    Args:
+        expert: The expert, opened in this process.
+        opener: Opens it in another, where it can't be sent as it is; sent by cloudpickle.
+        workers: How many.
+        timeout: Seconds after which a batch without an answer is an error, or None.
+
+    Raises:
+        ExpertError: If it can't be sent.
+    """
+    import cloudpickle
+
+    answer = expert.answer  # the lambda must not take the whole expert along
+    try:
+        parcel = cloudpickle.dumps(opener or (lambda: answer))
+    except Exception as error:  # each type that can't be sent has its own
+        raise ExpertError(
+            f"{expert.name} can't be sent to another process: {type(error).__name__}: {error}",
+            "a function that cloudpickle can take",
+            "pass the path of an ONNX file or a zip, open what can't be sent inside the function "
+            "at its first call, or write threads=True",
+        ) from error
+    titles = [f"worker {k + 1} of {workers} of {expert.name}" for k in range(workers)]
+    askers = [WorkerProcess(title, parcel, timeout) for title in titles]
+    return replace(expert, workers=WorkerPool(askers))
+
+
+class _Thread:
+    """Answers in the thread that asks; Python can't stop one."""
+
+    def __init__(self, answer: Answer) -> None:
+        self.answer = answer
+
+    def recover(self) -> None:
+        pass
+
+    def stop(self) -> None:
+        pass
