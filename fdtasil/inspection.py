@@ -1,0 +1,88 @@
+"""What an expert is, before anything is learnt from it: `fdtasil inspect`."""
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import tyro
+
+from fdtasil.calibration import calibrate
+from fdtasil.configuration import check_count
+from fdtasil.environments import EnvironmentPool, resolve_horizon
+from fdtasil.evaluation import random_behaviour
+from fdtasil.experts import load_expert
+from fdtasil.experts.gate import examine_expert
+from fdtasil.figures import draw_calibration
+from fdtasil.presets import PRESETS
+from fdtasil.rollouts import follow, rollout
+from fdtasil.scales import statistics
+from fdtasil.seeding import episode_seeds, generator
+from fdtasil.storage import write_bytes
+
+__all__ = ["EnvironmentId", "inspect_expert"]
+
+ExpertPath = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="EXPERT")]
+EnvironmentId = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ENV")]
+
+_CHANCE = "  (no worse than the expert: does it belong to this environment and version?)"
+
+
+def inspect_expert(
+    expert: ExpertPath,
+    env: EnvironmentId,
+    /,
+    *,
+    output: str | None = None,
+    episodes: int = 5,
+    horizon: int | None = None,
+    seed: int = 0,
+    picture: Path | None = None,
+) -> None:
+    """Show what an expert is: its contract with the environment, and the return it reaches.
+
+    Args:
+        expert: ONNX file.
+        env: Gymnasium id (module:Id imports the module first).
+        output: Name of the ONNX output with the actions.
+        episodes: Episodes that the return is measured over.
+        horizon: Steps after which an episode is cut; default: the environment's time limit.
+        seed: Of the episodes.
+        picture: PNG file to draw the ladder of radii into.
+    """
+    check_count("episodes", episodes)
+    with EnvironmentPool(env) as pool:
+        boxes, length = pool.boxes, resolve_horizon(horizon, pool)
+        opened = load_expert(expert, boxes.observation_size, boxes.action_size, output=output)
+        starts = episode_seeds(seed, "evaluation", 0, episodes)
+        recorded = rollout(follow(opened.policy("act")), pool, starts, length)
+        noise = [generator(seed, "random actions", episode) for episode in range(episodes)]
+        chance = rollout(random_behaviour(pool), pool, starts, length, noise).returns.mean()
+        visited = recorded.observations[recorded.valid]
+        spread = np.linspace(0, len(visited) - 1, 32).astype(int)
+        findings = examine_expert(opened, visited[spread], boxes)
+        usual = PRESETS["standard"].radius
+        random = generator(seed, "calibration")
+        found = calibrate(opened, visited, statistics(visited), random, usual)
+    returns, falls = recorded.returns, int(recorded.terminated.sum())
+    rows = [
+        ("expert", expert),
+        ("sha256", opened.sha256),
+        ("environment", pool.name),
+        ("observations", boxes.observation_size),
+        ("actions", f"{boxes.action_size}, from {boxes.low.min():g} to {boxes.high.max():g}"),
+        ("analytic", "a torch twin agrees with it" if opened.module else "not available"),
+        *((f.name, f"{'FAILED: ' if f.problem else ''}{f.measured}") for f in findings),
+        ("regime", found.regime),
+        ("noise floor", f"{found.noise_floor:.1e} of the action, root mean square"),
+        ("suggested radius", f"{found.radius:.2g} standard deviations, {found.stencil} stencil"),
+        ("return", f"{returns.mean():.1f} +- {returns.std():.1f} over {episodes} episodes"),
+        ("random actions", f"{chance:.1f}{_CHANCE if returns.mean() <= chance else ''}"),
+        ("ended early", f"{falls} of {episodes}, of at most {length} steps"),
+    ]
+    print("\n".join(f"{name:20}{value}" for name, value in rows))
+    if picture is not None:
+        write_bytes(picture, draw_calibration(found))
+        print(f"{'picture':20}{picture}")
+    problem = next((finding.problem for finding in findings if finding.problem), None)
+    if problem:
+        raise problem
