@@ -50,6 +50,13 @@ def main() -> int:
     running.add_argument("--quick", action="store_true", help="a smoke run of minutes")
     running.add_argument("--workers", type=int, default=1, help="processes of one thread each")
     running.add_argument("--backend", choices=BACKENDS, default="loky")
+    running.add_argument(
+        "--reuse",
+        nargs="+",
+        choices=BENCHMARKS,
+        default=[],
+        help="take over equal distillations of these, if run on this machine with these versions",
+    )
     running.add_argument("--out", type=Path, default=RESULTS, help="folder of the results files")
     drawing = commands.add_parser("draw", help="draw the figures and tables of a results file")
     drawing.add_argument("name", choices=BENCHMARKS)
@@ -69,7 +76,7 @@ def main() -> int:
         path,
         workers=arguments.workers,
         backend=arguments.backend,
-        known=known_results(BENCHMARKS.values(), arguments.out),
+        known=known_results((BENCHMARKS[name] for name in arguments.reuse), arguments.out),
     )
     print(f"{benchmark.name}: {len(cells)} cells, {len(failed)} failed now; results in {path}")
     return min(len(failed), 1)

@@ -1,51 +1,18 @@
 """Methods side by side: the picture and the tables that several benchmarks share."""
 
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING
 
-import numpy as np
-
+from benchmarks.panels import SHARE, draw_panels
 from benchmarks.runner import Row
-from benchmarks.statistics import (
-    difference_text,
-    interquartile_mean,
-    interval,
-    interval_text,
-    paired_difference,
-)
-from fdtasil.figures import png_of
+from benchmarks.statistics import difference_text, interval_text, paired_difference
 
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-__all__ = [
-    "Column",
-    "Scores",
-    "differences_table",
-    "draw_curve",
-    "draw_panels",
-    "scores_of",
-    "scores_table",
-]
+__all__ = ["Column", "Scores", "differences_table", "draw_scores", "scores_of", "scores_table"]
 
 Column = int | str
 """Where a score stands across a figure: a number of trajectories, or the name of a condition."""
 Scores = Mapping[tuple[str, Column], Mapping[str, Mapping[int, float]]]
 """(expert, column) -> method -> seed -> score; of complete groups only."""
 TRAJECTORIES = "trajectories"
-
-# Told apart without colour: marker, line and grey.
-_STYLES = (
-    ("o", ":", "0.0"),
-    ("s", "-", "0.0"),
-    ("^", "--", "0.0"),
-    ("v", "--", "0.45"),
-    ("D", "-", "0.45"),
-    ("P", "-.", "0.0"),
-    ("X", ":", "0.45"),
-    ("*", "-.", "0.45"),
-    ("h", "-", "0.7"),
-)
 
 
 def scores_of(rows: Sequence[Row], methods: Sequence[str], seeds: int) -> Scores:
@@ -95,11 +62,12 @@ def _head(columns: Sequence[str]) -> list[str]:
     return [f"| expert | {' | '.join(columns)} |", "|---" * (len(columns) + 1) + "|"]
 
 
-def draw_panels(
+def draw_scores(
     scores: Scores,
     methods: Sequence[str],
     label: Callable[[str], str],
     across: str = TRAJECTORIES,
+    score: str = SHARE,
 ) -> bytes:
     """Draw one panel an expert: score against column, a mark and an interval for each method.
 
@@ -108,67 +76,26 @@ def draw_panels(
         methods: In which order.
         label: A method -> what the legend calls it.
         across: What the columns are; empty where their names say it.
+        score: What is drawn upwards.
 
     Returns:
         A PNG, readable in black and white.
     """
-    from matplotlib.figure import Figure
-
-    experts = sorted({expert for expert, _ in scores})
     # Numbers by size, names as they come.
     columns = dict.fromkeys(column for _, column in scores)
     columns = sorted(columns, key=lambda column: column if isinstance(column, int) else 0)
-    figure = Figure(figsize=(3.4 * len(experts), 3.6), layout="constrained")
-    panels = figure.subplots(1, len(experts), sharey=True, squeeze=False)[0]
-    for panel, expert in zip(panels, experts, strict=True):
-        panel.axhline(1, color="0.8", linewidth=0.8, zorder=0)
-        for number, method in enumerate(methods):
-            # Beside each other, so that equal methods can still be told apart.
-            shift = (number - (len(methods) - 1) / 2) * 0.8 / len(methods)
-            values = {
-                place + shift: list(scores[expert, column][method].values())
-                for place, column in enumerate(columns)
-                if (expert, column) in scores
-            }
-            draw_curve(panel, values, number, label(method))
-        panel.set_title(expert, fontsize=10)
-        names = [str(column) for column in columns]
-        panel.set_xticks(range(len(columns)), names, rotation=0 if across else 90)
-        panel.set_xlim(-0.6, len(columns) - 0.4)
-        panel.set_xlabel(across)
-        panel.spines[["top", "right"]].set_visible(False)
-    panels[0].set_ylabel("return, share of the expert's")
-    handles, labels = panels[0].get_legend_handles_labels()
-    figure.legend(
-        handles, labels, loc="outside lower center", ncols=len(methods), fontsize=8, frameon=False
-    )
-    return png_of(figure)
 
+    def values(expert: str, number: int) -> dict[float, list[float]]:
+        # Beside each other, so that equal methods can still be told apart.
+        shift = (number - (len(methods) - 1) / 2) * 0.8 / len(methods)
+        return {
+            place + shift: list(scores[expert, column][methods[number]].values())
+            for place, column in enumerate(columns)
+            if (expert, column) in scores
+        }
 
-def draw_curve(
-    panel: "Axes", values: Mapping[float, Sequence[float]], number: int, name: str
-) -> None:
-    """Draw the means of a method and their intervals at places across a panel.
-
-    Args:
-        panel: Where.
-        values: Place -> the scores of all seeds.
-        number: Of the method, which has a style of its own.
-        name: What the legend calls it.
-    """
-    means = np.array([interquartile_mean(sample) for sample in values.values()])
-    low, high = np.transpose([interval(sample) for sample in values.values()])
-    marker, line, grey = _STYLES[number]
-    panel.errorbar(
-        list(values),
-        means,
-        yerr=np.maximum(0.0, [means - low, high - means]),
-        marker=marker,
-        markersize=4.5,
-        markerfacecolor="white" if number % 2 else grey,
-        linestyle=line,
-        linewidth=0.9,
-        elinewidth=0.8,
-        color=grey,
-        label=name,
-    )
+    curves = {
+        expert: {label(method): values(expert, k) for k, method in enumerate(methods)}
+        for expert in sorted({expert for expert, _ in scores})
+    }
+    return draw_panels(curves, across, score, [str(column) for column in columns])

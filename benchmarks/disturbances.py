@@ -1,32 +1,22 @@
 """What a policy meets on a machine and did not meet in its data: noise, pushes, other physics."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 from functools import partial
 from typing import Any
 
 import gymnasium
+import mujoco
 import numpy as np
 
-__all__ = ["DISTURBANCES", "Disturbance"]
+from fdtasil.seeding import generator
 
-Wrap = Callable[[gymnasium.Env, np.ndarray], gymnasium.Env]
-"""An environment and (n,) deviations of its observations -> the environment, disturbed."""
+__all__ = ["DISTURBANCES", "STEPS_BETWEEN_PUSHES", "Disturbance"]
 
-_EVERY = 50  # steps between two pushes
+Disturbance = Callable[[gymnasium.Env, np.ndarray], gymnasium.Env]
+"""A fresh MuJoCo environment and (n,) standard deviations of its observations -> the environment,
+disturbed. Equal seeds are disturbed equally."""
 
-
-@dataclass(frozen=True)
-class Disturbance:
-    """One way to disturb a MuJoCo environment; equal seeds are disturbed equally.
-
-    Attributes:
-        label: What figures call it.
-        wrap: Disturbs an environment.
-    """
-
-    label: str
-    wrap: Wrap
+STEPS_BETWEEN_PUSHES = 50
 
 
 class Noise(gymnasium.ObservationWrapper):
@@ -40,11 +30,12 @@ class Noise(gymnasium.ObservationWrapper):
 
     def __init__(self, env: gymnasium.Env, deviations: np.ndarray, size: float) -> None:
         super().__init__(env)
-        self._deviations, self._random = size * deviations, np.random.default_rng()
+        self._deviations, self._random = size * deviations, generator(0, "noise")
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
-        """Begin the noise anew too."""
-        self._random = np.random.default_rng(seed)
+        """Begin the noise of the seed."""
+        if seed is not None:
+            self._random = generator(seed, "noise")
         return super().reset(seed=seed, options=options)
 
     def observation(self, observation: np.ndarray) -> np.ndarray:
@@ -54,76 +45,72 @@ class Noise(gymnasium.ObservationWrapper):
 
 
 class Pushes(gymnasium.Wrapper):
-    """Pushes the first body in a random horizontal direction, for one step every 50 steps.
+    """Pushes the first body for one step every 50 steps, in a random horizontal direction.
+
+    A planar robot is pushed forwards or backwards: it can't be moved aside.
 
     Args:
         env: The environment.
+        deviations: Not used.
         speed: That a push gives to the whole body's mass, in m/s.
     """
 
-    def __init__(self, env: gymnasium.Env, speed: float) -> None:
+    def __init__(self, env: gymnasium.Env, deviations: np.ndarray, speed: float) -> None:
         super().__init__(env)
-        self._speed, self._random, self._steps = speed, np.random.default_rng(), 0
+        self._speed, self._random, self._steps = speed, generator(0, "pushes"), 0
+        self._inner: Any = env.unwrapped
+        self._planar = self._inner.model.jnt_type[0] != mujoco.mjtJoint.mjJNT_FREE
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> Any:
-        """Begin the pushes anew too."""
-        self._random, self._steps = np.random.default_rng(seed), 0
+        """Begin the pushes of the seed."""
+        self._steps = 0
+        if seed is not None:
+            self._random = generator(seed, "pushes")
         return self.env.reset(seed=seed, options=options)
 
     def step(self, action: np.ndarray) -> Any:
         """Step, under a push where one is due."""
-        inner: Any = self.unwrapped
+        model, data = self._inner.model, self._inner.data
         self._steps += 1
-        if self._steps % _EVERY == 0:
-            angle = self._random.uniform(0, 2 * np.pi)
-            force = inner.model.body_mass.sum() * self._speed / inner.dt
-            inner.data.xfrc_applied[1, :2] = force * np.array([np.cos(angle), np.sin(angle)])
+        if self._steps % STEPS_BETWEEN_PUSHES == 0:
+            force = model.body_mass.sum() * self._speed / self._inner.dt
+            data.xfrc_applied[1, :2] = force * self._direction()
         try:
             return self.env.step(action)
         finally:
-            inner.data.xfrc_applied[1] = 0
+            data.xfrc_applied[1] = 0
+
+    def _direction(self) -> np.ndarray:
+        if self._planar:
+            return np.array([self._random.choice([-1.0, 1.0]), 0.0])
+        angle = self._random.uniform(0, 2 * np.pi)
+        return np.array([np.cos(angle), np.sin(angle)])
 
 
-def _as_it_is(env: gymnasium.Env, deviations: np.ndarray) -> gymnasium.Env:
+def _undisturbed(env: gymnasium.Env, deviations: np.ndarray) -> gymnasium.Env:
     return env
 
 
-def _pushed(env: gymnasium.Env, deviations: np.ndarray, speed: float) -> gymnasium.Env:
-    return Pushes(env, speed)
-
-
 def _heavier(env: gymnasium.Env, deviations: np.ndarray, factor: float) -> gymnasium.Env:
-    model: Any = env.unwrapped.model
-    model.body_mass[:] *= factor
-    model.body_inertia[:] *= factor
+    inner: Any = env.unwrapped
+    inner.model.body_mass[:] *= factor
+    inner.model.body_inertia[:] *= factor
+    mujoco.mj_setConst(inner.model, inner.data)  # what the simulator derives from the masses
     return env
 
 
 def _rougher(env: gymnasium.Env, deviations: np.ndarray, factor: float) -> gymnasium.Env:
-    model: Any = env.unwrapped.model
-    model.geom_friction[:, 0] *= factor
+    inner: Any = env.unwrapped
+    inner.model.geom_friction[:, 0] *= factor
     return env
 
 
-DISTURBANCES = {
-    "none": Disturbance("none", _as_it_is),
-    **{
-        f"noise {size:g}": Disturbance(f"noise {size:g}", partial(Noise, size=size))
-        for size in (0.05, 0.1, 0.2)
-    },
-    **{
-        f"push {speed:g}": Disturbance(f"pushes {speed:g} m/s", partial(_pushed, speed=speed))
-        for speed in (0.5, 1.0, 2.0)
-    },
-    **{
-        f"mass {factor:g}": Disturbance(f"mass x {factor:g}", partial(_heavier, factor=factor))
-        for factor in (0.8, 1.2)
-    },
-    **{
-        f"friction {factor:g}": Disturbance(
-            f"friction x {factor:g}", partial(_rougher, factor=factor)
-        )
-        for factor in (0.5, 2.0)
-    },
+DISTURBANCES: dict[str, Disturbance] = {
+    "none": _undisturbed,
+    **{f"noise {size:g}": partial(Noise, size=size) for size in (0.05, 0.1, 0.2)},
+    **{f"pushes {speed:g} m/s": partial(Pushes, speed=speed) for speed in (0.25, 0.5, 1.0)},
+    **{f"mass x {factor:g}": partial(_heavier, factor=factor) for factor in (0.8, 1.2)},
+    **{f"friction x {factor:g}": partial(_rougher, factor=factor) for factor in (0.5, 2.0)},
 }
-"""By the name that results use; the paper's experts know none of them but "none"."""
+"""By the name that results and figures use. Noise is in standard deviations of the demonstrations'
+observations, a push comes every 50 steps, mass takes inertia along."""

@@ -3,12 +3,12 @@
 from collections.abc import Sequence
 from typing import Any
 
-from benchmarks.comparison import differences_table, draw_panels, scores_of, scores_table
+from benchmarks.comparison import differences_table, draw_scores, scores_of, scores_table
 from benchmarks.controllers import available
 from benchmarks.distillation import distillations
 from benchmarks.runner import Cell, Row
 
-__all__ = ["FINITE_DIFFERENCE"]
+__all__ = ["FINITE_DIFFERENCE", "HORIZON", "LABELS", "METHODS", "SEEDS", "experts"]
 
 ENVIRONMENTS = ("Walker2d", "HalfCheetah", "Ant", "Humanoid")
 SEEDS = range(5)
@@ -97,7 +97,7 @@ def draw(rows: Sequence[Row]) -> dict[str, bytes]:
         scores = scores_of(mine, list(methods), len(SEEDS))
         if not scores:
             continue
-        picture = draw_panels(scores, list(methods), lambda m: LABELS.get(m, f"{m} probes"))
+        picture = draw_scores(scores, list(methods), lambda m: LABELS.get(m, f"{m} probes"))
         files[f"finite_difference_{preset}.png"] = picture
         text += f"## Preset `{preset}`\n\n{scores_table(scores, list(methods))}\n"
         text += f"Differences on equal seeds:\n\n{differences_table(scores, PAIRS)}\n"

@@ -1,6 +1,6 @@
 """What happens to a student where the machine is not the simulator: noise, pushes, mass, grip."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -8,24 +8,32 @@ import gymnasium
 import numpy as np
 
 import fdtasil
-from benchmarks.comparison import Column, Scores, differences_table, draw_panels, scores_table
+from benchmarks.comparison import Column, Scores, differences_table, draw_scores, scores_table
 from benchmarks.controllers import CONTROLLERS
-from benchmarks.disturbances import DISTURBANCES, Disturbance
-from benchmarks.finite_difference import METHODS, experts
+from benchmarks.disturbances import DISTURBANCES, STEPS_BETWEEN_PUSHES, Disturbance
+from benchmarks.finite_difference import HORIZON, LABELS, METHODS, SEEDS, experts
 from benchmarks.runner import Benchmark, Cell, Row
 
 __all__ = ["ROBUSTNESS"]
 
-SEEDS = range(5)
-EPISODES, HORIZON = 5, 300
+EPISODES = 5
 STUDENTS = ("plain", "10", "augmentation")
+COLUMNS = ("expert", *STUDENTS)
 PAIRS = (("10", "plain"), ("10", "augmentation"), ("10", "expert"))
-LABELS = {
-    "expert": "expert",
-    "plain": "plain cloning",
-    "10": "10 probes",
-    "augmentation": "10 answers as labels",
-}
+KEPT = (
+    "expert_return",
+    "student_return",
+    "expert_survival",
+    "survival",
+    "expert_physics_resets",
+    "physics_resets",
+)
+HEAD = f"""\
+Shares of the undisturbed expert's return, {EPISODES} trajectories of {HORIZON} steps, \
+{len(SEEDS)} seeds. Noise is in standard deviations of the demonstrations' observations; a push
+comes every {STEPS_BETWEEN_PUSHES} steps and gives the whole body the speed; mass takes inertia
+along. Humanoid observes its masses, so that they disturb its input too.
+"""
 
 
 def cells(quick: bool) -> list[Cell]:
@@ -40,31 +48,49 @@ def cells(quick: bool) -> list[Cell]:
 
 def run(cell: Cell) -> dict[str, Any]:
     """Distil in the usual environment, and compare with the expert in every disturbed one."""
-    path, environment = CONTROLLERS[cell["expert"]].open()
+    return compare_under_disturbances(
+        cell["expert"], cell["seed"], METHODS["standard"][cell["method"]]
+    )
+
+
+def compare_under_disturbances(
+    expert: str, seed: int, settings: Mapping[str, Any]
+) -> dict[str, Any]:
+    """Distil once, and return what student and expert reach under each disturbance.
+
+    Args:
+        expert: A name of `CONTROLLERS`.
+        seed: Of the distillation, the starts and the disturbances.
+        settings: Further arguments of `distill`.
+    """
+    path, environment = CONTROLLERS[expert].open()
     result = fdtasil.distill(
         path,
         environment,
         episodes=EPISODES,
         horizon=HORIZON,
-        seed=cell["seed"],
+        seed=seed,
         evaluation_episodes=1,  # judged below
         progress=False,
-        **METHODS["standard"][cell["method"]],
+        **settings,
     )
     deviations = result.dataset.demonstrations.observations.std(axis=0, dtype=np.float64)
-    found = {}
+    found: dict[str, Any] = {}
     for name, disturbance in DISTURBANCES.items():
         make = partial(_make, disturbance, environment, deviations)
-        evaluation = fdtasil.evaluate(
-            result.student, path, make, horizon=HORIZON, seed=cell["seed"], progress=False
-        )
-        keys = ("expert_return", "student_return", "expert_survival", "survival")
-        found[name] = {key: getattr(evaluation, key) for key in keys}
+        try:
+            evaluation = fdtasil.evaluate(
+                result.student, path, make, horizon=HORIZON, seed=seed, progress=False
+            )
+        except fdtasil.FdtasilError as error:  # an expert that this disturbance makes useless
+            found[name] = {"refused": str(error)}
+        else:
+            found[name] = {key: getattr(evaluation, key) for key in KEPT}
     return found
 
 
 def _make(disturbance: Disturbance, environment: str, deviations: np.ndarray) -> gymnasium.Env:
-    return disturbance.wrap(gymnasium.make(environment), deviations)
+    return disturbance(gymnasium.make(environment), deviations)
 
 
 def draw(rows: Sequence[Row]) -> dict[str, bytes]:
@@ -72,37 +98,69 @@ def draw(rows: Sequence[Row]) -> dict[str, bytes]:
     scores = _scores(rows)
     if not scores:
         return {}
-    methods = list(LABELS)
+    missing = [
+        f"{expert} under {name}"
+        for expert in dict.fromkeys(expert for expert, _ in scores)
+        for name in DISTURBANCES
+        if (expert, name) not in scores
+    ]
     text = (
-        f"Share of the undisturbed expert's return, {EPISODES} trajectories of {HORIZON} steps, "
-        f"{len(SEEDS)} seeds:\n\n{scores_table(scores, methods, 'disturbance')}\n"
-        f"Differences on equal seeds:\n\n{differences_table(scores, PAIRS, 'disturbance')}"
+        f"{HEAD}\n{scores_table(scores, COLUMNS, 'disturbance')}\n"
+        f"Differences on equal seeds:\n\n{differences_table(scores, PAIRS, 'disturbance')}\n"
+        "Left out, for the expert could not be followed or the simulator reset itself: "
+        f"{', '.join(missing) or 'nothing'}.\n"
     )
-    picture = draw_panels(scores, methods, LABELS.__getitem__, across="")
+    picture = draw_scores(
+        scores,
+        COLUMNS,
+        lambda method: LABELS.get(method, f"{method} probes"),
+        across="",
+        score="return, share of the undisturbed expert's",
+    )
     return {"robustness.png": picture, "robustness.md": text.encode()}
 
 
 def _scores(rows: Sequence[Row]) -> Scores:
-    """Return the shares of the undisturbed expert's return; of experts with every cell."""
-    by_cell = {
+    """Return the shares of the undisturbed expert's return; of experts with every cell.
+
+    A disturbance that was refused, or that made the simulator reset itself, has no share.
+    """
+    results = {
         (row["cell"]["expert"], row["cell"]["method"], row["cell"]["seed"]): row["result"]
         for row in rows
     }
     scores: dict[tuple[str, Column], dict[str, dict[int, float]]] = {}
     for expert in dict.fromkeys(row["cell"]["expert"] for row in rows):
-        if any((expert, m, seed) not in by_cell for m in STUDENTS for seed in SEEDS):
+        keys = [(expert, method, seed) for method in STUDENTS for seed in SEEDS]
+        if not all(key in results for key in keys):
             continue
-        for name, disturbance in DISTURBANCES.items():
-            group: dict[str, dict[int, float]] = {method: {} for method in LABELS}
-            for seed in SEEDS:
-                for method in STUDENTS:
-                    result = by_cell[expert, method, seed]
-                    whole = result["none"]["expert_return"]
-                    group[method][seed] = result[name]["student_return"] / whole
-                    # The same in every student's cell: equal seeds, equal disturbances.
-                    group["expert"][seed] = result[name]["expert_return"] / whole
-            scores[expert, disturbance.label] = group
+        for name in DISTURBANCES:
+            if all(_counts(results[key][name]) for key in keys):
+                scores[expert, name] = _shares(results, expert, name)
     return scores
+
+
+def _counts(result: Mapping[str, Any]) -> bool:
+    return "refused" not in result and not (
+        result["expert_physics_resets"] or result["physics_resets"]
+    )
+
+
+def _shares(
+    results: Mapping[tuple[str, str, int], Mapping[str, Any]], expert: str, disturbance: str
+) -> dict[str, dict[int, float]]:
+    """Return column -> seed -> share of the undisturbed expert's return."""
+    shares: dict[str, dict[int, float]] = {column: {} for column in COLUMNS}
+    for seed in SEEDS:
+        for method in STUDENTS:
+            result = results[expert, method, seed]
+            whole, found = result["none"]["expert_return"], result[disturbance]
+            shares[method][seed] = found["student_return"] / whole
+            theirs = found["expert_return"] / whole
+            # Equal seeds, equal disturbances: every student's cell has the same expert.
+            if abs(shares["expert"].setdefault(seed, theirs) - theirs) > 1e-9:
+                raise ValueError(f"{expert}, {disturbance}, seed {seed}: the expert differs")
+    return shares
 
 
 ROBUSTNESS = Benchmark("robustness", __doc__ or "", cells, run, draw)

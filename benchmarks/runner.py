@@ -84,7 +84,9 @@ def run(
         path: The results file, one JSON object a line; made if it is not there.
         workers: Processes at once, one thread each.
         backend: One of `BACKENDS`.
-        known: From `known_results`: what other benchmarks have run already.
+        known: From `known_results`: rows of other benchmarks, taken over where the arguments,
+            the machine and the versions are the same. Each keeps its commit: that the library
+            still does the same is the caller's to know.
 
     Returns:
         The rows of those cells that failed now.
@@ -101,6 +103,7 @@ def run(
     about = {"commit": _commit(), "versions": versions()}
     with path.open("a") as file:
         file.writelines(json.dumps(row) + "\n" for row in reused.values())
+        file.flush()
         rows = BACKENDS[backend](benchmark, due, 1 if benchmark.alone else workers)
         for row in tqdm(rows, total=len(due), desc=benchmark.name, unit="cell", mininterval=5):
             # The parent alone writes, whole lines at once: a kill loses the cells under way.
@@ -149,14 +152,15 @@ def results_of(rows: Iterable[Row]) -> list[Row]:
 def _reused(
     benchmark: Benchmark, cells: Sequence[Cell], known: Mapping[str, Row]
 ) -> dict[str, Row]:
-    """Return the rows of those cells whose distillation another benchmark has run."""
+    """Return the rows of those cells whose distillation another benchmark has run here."""
     if benchmark.arguments is None:
         return {}
-    found = {_key(cell): known.get(_key(benchmark.arguments(cell))) for cell in cells}
+    here = {"versions": versions(), "machine": _machine()}
     return {
         _key(cell): {**row, "cell": dict(cell)}
         for cell in cells
-        if (row := found[_key(cell)]) is not None
+        if (row := known.get(_key(benchmark.arguments(cell)))) is not None
+        and all(row[name] == value for name, value in here.items())
     }
 
 

@@ -3,16 +3,14 @@
 from collections.abc import Sequence
 from typing import Any
 
-from benchmarks.comparison import differences_table, draw_panels, scores_of, scores_table
+from benchmarks.comparison import differences_table, draw_scores, scores_of, scores_table
 from benchmarks.controllers import available
 from benchmarks.distillation import distillations
-from benchmarks.finite_difference import experts
+from benchmarks.finite_difference import HORIZON, SEEDS, experts
 from benchmarks.runner import Cell, Row
 
 __all__ = ["MUJOCO"]
 
-SEEDS = range(5)
-HORIZON = 300
 BUDGETS = (5, 20)
 SOURCES: dict[str, int | str] = {"plain": 0, "probes": 10, "jacobian": "jacobian"}
 # What is the default is left out: other benchmarks' cells are then seen to be the same.
@@ -63,7 +61,7 @@ def draw(rows: Sequence[Row]) -> dict[str, bytes]:
     differences = differences_table(scores, PAIRS)
     text = f"{scores_table(scores, list(METHODS))}\nDifferences on equal seeds:\n\n{differences}"
     return {
-        "mujoco.png": draw_panels(scores, list(METHODS), lambda method: method),
+        "mujoco.png": draw_scores(scores, list(METHODS), lambda method: method),
         "mujoco.md": text.encode(),
     }
 

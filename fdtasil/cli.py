@@ -4,28 +4,30 @@ import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import tyro
 
 from fdtasil.distilled import Distilled
 from fdtasil.errors import FdtasilError, SettingError
 from fdtasil.evaluation import interval_text, score_text
-from fdtasil.inspection import EnvironmentId, inspect_expert
+from fdtasil.inspection import inspect_expert
 from fdtasil.pipeline import distill, evaluate
 from fdtasil.sb3 import export_sb3
-from fdtasil.shell import as_command
+from fdtasil.shell import (
+    AgentPath,
+    EnvironmentId,
+    OptionalEnvironment,
+    OptionalExpert,
+    PolicyPath,
+    as_command,
+)
 from fdtasil.storage import to_json, write_bytes
 
 __all__ = ["COMMANDS", "main"]
 
 COMMAND = "command.json"
 """File of a run's folder with the arguments that `fdtasil distill` was called with."""
-
-OptionalExpert = Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="EXPERT")]
-OptionalEnvironment = Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="ENV")]
-PolicyPath = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="POLICY")]
-AgentPath = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="AGENT.zip")]
 
 
 def _distill(compare: bool, **arguments: Any) -> None:

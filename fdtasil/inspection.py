@@ -1,10 +1,8 @@
 """What an expert is, before anything is learnt from it: `fdtasil inspect`."""
 
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
-import tyro
 
 from fdtasil.calibration import calibrate
 from fdtasil.configuration import check_count
@@ -17,12 +15,11 @@ from fdtasil.presets import PRESETS
 from fdtasil.rollouts import follow, rollout
 from fdtasil.scales import statistics
 from fdtasil.seeding import episode_seeds, generator
+from fdtasil.shell import EnvironmentId, ExpertPath
 from fdtasil.storage import write_bytes
 
-__all__ = ["EnvironmentId", "inspect_expert"]
+__all__ = ["inspect_expert"]
 
-ExpertPath = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="EXPERT")]
-EnvironmentId = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ENV")]
 
 _CHANCE = "  (no worse than the expert: does it belong to this environment and version?)"
 

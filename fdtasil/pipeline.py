@@ -220,7 +220,7 @@ def distill(
             state = RunState(run, subject.expert, student_obs, kept, dataset=given)
             callbacks = tell_all(callback, log_formats, folder)
             training = Training(state, place, Stages(progress), interrupts, callbacks)
-            result = _go(state, subject, training, notes, force=force)
+            result = _go(training, subject, notes, force=force)
             if folder:
                 result.save(folder)
                 kept.close()
@@ -286,11 +286,10 @@ def evaluate(
         return judge(answer, black_box, theirs, pool, length, seed, stages)
 
 
-def _go(
-    state: RunState, subject: Subject, training: Training, notes: list[str], *, force: bool
-) -> Distilled:
+def _go(training: Training, subject: Subject, notes: list[str], *, force: bool) -> Distilled:
     """Gate, rounds, comparison, report."""
-    run, stages, expert, pool = state.run, training.stages, subject.expert, subject.pool
+    state, run = training.state, training.state.run
+    stages, expert, pool = training.stages, subject.expert, subject.pool
     with torch_settings(training.device) as precision:
         theirs = None
         if expert is not None and pool is not None:
@@ -298,7 +297,7 @@ def _go(
             rows = sum(run.predicted_queries().values())
             theirs = examine(expert, pool, starts, run.horizon, stages, force=force, rows=rows)
         started = time.perf_counter()
-        Rounds(state, pool, training).all()
+        Rounds(pool, training).all()
         seconds, student, evaluation = time.perf_counter() - started, state.trained, None
         if expert is not None and pool is not None and theirs is not None:
             policy = state.view.policy(student.act)

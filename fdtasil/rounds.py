@@ -21,14 +21,17 @@ class Rounds:
     """In which order the state of a run grows.
 
     Attributes:
-        state: What grows.
         pool: The environment; None where nothing has to be recorded.
-        training: Makes each round's student.
+        training: Makes each round's student, and holds what grows.
     """
 
-    state: RunState
     pool: EnvironmentPool | None
     training: Training
+
+    @property
+    def state(self) -> RunState:
+        """What grows."""
+        return self.training.state
 
     def all(self) -> None:
         """Do every round, beginning where the folder's checkpoints end."""

@@ -7,7 +7,22 @@ from typing import Annotated, Any, Union, get_args, get_origin
 
 import tyro
 
-__all__ = ["as_command"]
+__all__ = [
+    "AgentPath",
+    "EnvironmentId",
+    "ExpertPath",
+    "OptionalEnvironment",
+    "OptionalExpert",
+    "PolicyPath",
+    "as_command",
+]
+
+OptionalExpert = Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="EXPERT")]
+OptionalEnvironment = Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="ENV")]
+PolicyPath = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="POLICY")]
+AgentPath = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="AGENT.zip")]
+ExpertPath = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="EXPERT")]
+EnvironmentId = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ENV")]
 
 # Bars are silent by themselves where there is no terminal; a function has no name in a shell.
 _ONLY_PYTHON = ("progress", "callback")

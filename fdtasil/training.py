@@ -57,8 +57,8 @@ class Training:
         resume, asked_pool = self._resumed(round_)
         pools = _Pools(state, view, round_, asked_pool)
         total = run.fit.total_steps(len(seen))
+        student = self._fresh(seen, round_)
         with self.stages.stage(f"training, round {round_}", total, "step") as move:
-            student = self._fresh(seen, round_)
             entries = fit(
                 student.to(self.device),
                 seen,

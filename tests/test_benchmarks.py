@@ -161,26 +161,55 @@ def arguments(cell):
     return {"tripled": 3 * cell["number"]}
 
 
-def test_benchmarks_share_the_results_of_equal_distillations(tmp_path):
-    """Whatever the cells are called: the arguments say whether two are the same."""
-    ran = []
-
+def tripling(name, cells, ran):
     def triple(cell):
         ran.append(cell["number"])
         return arguments(cell)
 
-    cells = [{"number": number} for number in range(3)]
-    first = Benchmark("first", "", lambda quick: cells, triple, dict, arguments=arguments)
+    return Benchmark(name, "", lambda quick: cells, triple, dict, arguments=arguments)
+
+
+def test_benchmarks_share_the_results_of_equal_distillations(tmp_path):
+    """Whatever the cells are called: the arguments say whether two are the same."""
+    ran, cells = [], [{"number": number} for number in range(3)]
+    first = tripling("first", cells, ran)
     run(first, cells[:2], first.results(tmp_path))
-    known = known_results([first, TOY], tmp_path)
-    second = Benchmark("second", "", lambda quick: [], triple, dict, arguments=arguments)
-    renamed = [{"name": "new", **cell} for cell in cells]
-    run(second, renamed, second.results(tmp_path), known=known)
+    second = tripling("second", [{"name": "new", **cell} for cell in cells], ran)
+    path, known = second.results(tmp_path), known_results([first, TOY], tmp_path)
+    run(second, second.cells(False), path, known=known)
     assert ran == [0, 1, 2]
-    rows = {row["cell"]["number"]: row for row in read_rows(second.results(tmp_path))}
+    rows = {row["cell"]["number"]: row for row in read_rows(path)}
     assert [rows[number]["result"]["tripled"] for number in range(3)] == [0, 3, 6]
     assert [rows[number].get("from") for number in range(3)] == ["first", "first", None]
     assert all(row["cell"]["name"] == "new" for row in rows.values())
+
+
+@pytest.mark.parametrize("name", ["machine", "versions"])
+def test_results_of_other_machines_and_versions_are_not_shared(name, tmp_path):
+    """Equal seeds give equal bytes on one machine with equal versions, and nowhere else."""
+    ran, cells = [], [{"number": 0}]
+    first, second = (tripling(title, cells, ran) for title in ("first", "second"))
+    run(first, cells, first.results(tmp_path))
+    known = {
+        key: {**row, name: "another"} for key, row in known_results([first], tmp_path).items()
+    }
+    run(second, cells, second.results(tmp_path), known=known)
+    assert ran == [0, 0]
+
+
+def test_distillations_are_sent_to_other_processes(tmp_path):
+    from benchmarks.distillation import distillations
+
+    def short(cell):
+        shape = {"episodes": 1, "horizon": 10, "steps": 5, "hidden": (8,)}
+        return {"expert": "Swimmer-v5", "evaluation_episodes": 2, **shape, **cell}
+
+    cells = [{"probes": count, "seed": 0} for count in (0, 2)]
+    tiny = distillations("tiny", "", lambda quick: cells, short, dict)
+    assert run(tiny, cells, tiny.results(tmp_path), workers=2) == []
+    for row in read_rows(tiny.results(tmp_path)):
+        assert row["result"]["queries"]["probe"] == 10 * row["cell"]["probes"]
+        assert row["result"]["normalized_return"] is not None
 
 
 def test_the_same_distillation_is_found_in_several_benchmarks():
@@ -197,37 +226,49 @@ def test_the_same_distillation_is_found_in_several_benchmarks():
 
 
 def test_return_against_questions():
-    """Ten probes cost eleven questions a step here; the rival's return at equal cost is known."""
+    """Every purpose counts; a rival is taken at the first of its budgets that asks no less."""
     from benchmarks.queries import QUERIES
 
     def result(cell):
-        factor = int(cell["method"]) + 1 if cell["method"].isdigit() else 1
-        asked = 300 * cell["episodes"] * factor
-        score = 0.1 * np.log(asked) + (0.25 if factor > 1 else 0)  # a quarter above the rivals
-        return {"queries": {"act": asked, "check": 96}, "normalized_return": float(score)}
+        acted = 300 * cell["episodes"]
+        queries, score = {"act": acted, "check": 96, "evaluate": 9000}, 0.001 * cell["episodes"]
+        if cell["method"].isdigit():
+            queries |= {"probe": acted * int(cell["method"]), "calibrate": 1008}
+            score += 0.5
+        if cell["method"] == "dagger":
+            queries = {"act": acted - 100, "label": 100}
+        return {"queries": queries, "normalized_return": score}
 
     rows = [{"cell": cell, "result": result(cell)} for cell in QUERIES.cells(False)]
     files = QUERIES.draw(rows)
     assert files["queries.png"].startswith(b"\x89PNG")
     table = files["queries.md"].decode()
     expert = rows[0]["cell"]["expert"]
-    line = f"| {expert} | 10 probes | 1 | 3,300 | +0.25 [+0.25, +0.25] | +0.25 [+0.25, +0.25] |"
-    assert line in table
-    assert f"| {expert} | 50 probes | 20 | 306,000 | out of reach | out of reach |" in table
+    # 300 to act, 1,008 to calibrate, 3,000 probes: cloning asks 6,000 with 20, 24,000 with 80.
+    head = f"| {expert} | 10 probes | 1 | 4,308 |"
+    assert f"{head} +0.48 [+0.48, +0.48] | +0.42 [+0.42, +0.42] | +0.48 [+0.48, +0.48] |" in table
+    assert f"{head} 0.50 [0.50, 0.50] |" in table
+    assert f"| {expert} | 50 probes | 20 | 307,008 | asks less | asks less | asks less |" in table
+    assert f"| {expert} | DAgger | 5 | 1,500 |" in table
     assert QUERIES.draw(rows[1:60]) == {}
 
 
-def test_a_student_beside_its_expert_under_disturbances():
+def disturbed_row(cell):
     from benchmarks.disturbances import DISTURBANCES
+
+    share = {"plain": 0.5, "10": 0.9, "augmentation": 0.8}[cell["method"]]
+    calm = {"physics_resets": 0, "expert_physics_resets": 0}
+    usual = {"expert_return": 200.0, "student_return": 200 * share, **calm}
+    fallen = {"expert_return": 100.0, "student_return": 100 * share, **calm}
+    result = {name: usual if name == "none" else fallen for name in DISTURBANCES}
+    result["mass x 1.2"] = {"refused": "all episodes ended at once"}
+    return {"cell": cell, "result": result}
+
+
+def test_a_student_beside_its_expert_under_disturbances():
     from benchmarks.robustness import ROBUSTNESS
 
-    def result(cell):
-        share = {"plain": 0.5, "10": 0.9, "augmentation": 0.8}[cell["method"]]
-        expert = {"expert_return": 200.0, "student_return": 200 * share}
-        fallen = {"expert_return": 100.0, "student_return": 100 * share}
-        return {name: expert if name == "none" else fallen for name in DISTURBANCES}
-
-    rows = [{"cell": cell, "result": result(cell)} for cell in ROBUSTNESS.cells(False)]
+    rows = [disturbed_row(cell) for cell in ROBUSTNESS.cells(False)]
     files = ROBUSTNESS.draw(rows)
     assert files["robustness.png"].startswith(b"\x89PNG")
     table = files["robustness.md"].decode()
@@ -235,24 +276,57 @@ def test_a_student_beside_its_expert_under_disturbances():
     assert f"| {name} | none | 1.00 [1.00, 1.00] | 0.50 [0.50, 0.50] | 0.90 [0.90," in table
     assert f"| {name} | noise 0.1 | 0.50 [0.50, 0.50] | 0.25 [0.25, 0.25] | 0.45 [0.45," in table
     assert "| +0.40 [+0.40, +0.40] |" in table
+    assert f"itself: {name} under mass x 1.2" in table
+    rows[0]["result"]["noise 0.1"] = {**rows[0]["result"]["none"], "expert_return": 7.0}
+    with pytest.raises(ValueError, match="the expert differs"):
+        ROBUSTNESS.draw(rows)
 
 
-@pytest.mark.parametrize("name", ["noise 0.2", "push 1", "mass 1.2", "friction 0.5"])
-def test_equal_seeds_are_disturbed_equally(name):
+@pytest.mark.slow
+def test_every_disturbance_runs():
+    from benchmarks.disturbances import DISTURBANCES
+    from benchmarks.robustness import compare_under_disturbances
+
+    found = compare_under_disturbances("Walker2d-v5", 0, {"probes": 0, "steps": 10})
+    assert found.keys() == DISTURBANCES.keys()
+    assert all(result["expert_return"] > 100 for result in found.values())
+    returns = [result["expert_return"] for result in found.values()]
+    assert len(set(returns)) == len(returns)
+
+
+def episode(env, seed):
+    first, _ = env.reset(seed=seed)
+    zero = np.zeros(env.action_space.shape, np.float32)
+    return np.array([first, *(env.step(zero)[0] for _ in range(60))])
+
+
+@pytest.mark.parametrize("body", ["Walker2d-v5", "Ant-v5"])
+@pytest.mark.parametrize("name", ["noise 0.2", "pushes 1 m/s", "mass x 1.2", "friction x 0.5"])
+def test_equal_seeds_are_disturbed_equally(name, body):
     import gymnasium
 
     from benchmarks.disturbances import DISTURBANCES
 
-    def observations(seed, disturbed):
-        env = gymnasium.make("Walker2d-v5")
-        env = DISTURBANCES[name].wrap(env, np.ones(17)) if disturbed else env
-        first, _ = env.reset(seed=seed)
-        zero = np.zeros(6, np.float32)
-        return np.array([first, *(env.step(zero)[0] for _ in range(60))])
+    deviations = np.ones(gymnasium.make(body).observation_space.shape)
+    env = DISTURBANCES[name](gymnasium.make(body), deviations)
+    first, other, again = (episode(env, seed) for seed in (3, 4, 3))
+    np.testing.assert_array_equal(first, again)
+    usual, usual_other = (episode(gymnasium.make(body), seed) for seed in (3, 4))
+    assert np.abs(first - usual).max() > 0.01
+    if name == "noise 0.2":
+        assert np.abs((first - usual) - (other - usual_other))[0].max() > 0.01
+    if name == "pushes 1 m/s":  # nothing before the first push
+        np.testing.assert_array_equal(first[:50], usual[:50])
 
-    same = observations(3, True)
-    np.testing.assert_array_equal(same, observations(3, True))
-    usual = observations(3, False)
-    assert np.abs(same - usual).max() > 0.01
-    if name == "push 1":  # nothing before the first push
-        np.testing.assert_array_equal(same[:50], usual[:50])
+
+def test_what_is_derived_from_masses_follows_them():
+    """Humanoid observes quantities that the simulator derives from the masses beforehand."""
+    import gymnasium
+
+    from benchmarks.disturbances import DISTURBANCES
+
+    usual = gymnasium.make("Humanoid-v5")
+    heavier = DISTURBANCES["mass x 1.2"](gymnasium.make("Humanoid-v5"), np.ones(348))
+    masses, model = usual.unwrapped.model.body_mass, heavier.unwrapped.model
+    np.testing.assert_allclose(model.body_mass, 1.2 * masses)
+    np.testing.assert_allclose(model.body_subtreemass[1], model.body_mass.sum())

@@ -10,8 +10,8 @@ import fdtasil
 # From the top of the house to its cellar; a room may import only what stands below it.
 ORDER = [
     "cli",
-    "shell",
     "inspection",
+    "shell",
     "testing",
     "pipeline",
     "subject",

@@ -103,9 +103,9 @@ def _stored(place: Place) -> Path:
         place, files = look_up(place)
         if files and place.file not in files:
             raise no_file(place, sorted(files))
-        check_statistics(place, files)
+        _check_statistics(place, files)
         data = download(place)
-        check_whole(place, data, files.get(place.file))
+        _check_whole(place, data, files.get(place.file))
         write_bytes(path, data)
     return path
 
@@ -125,7 +125,7 @@ def _folder(place: Place) -> Path:
         ) from error
 
 
-def check_statistics(place: Place, files: "dict[str, RepoSibling]") -> None:
+def _check_statistics(place: Place, files: "dict[str, RepoSibling]") -> None:
     """Refuse to leave out statistics that `read_agent` would find beside a zip on disk."""
     agent = PurePosixPath(place.file)
     found = [name for name in sorted(files) if _normalises(PurePosixPath(name), agent, files)]
@@ -145,7 +145,7 @@ def _normalises(path: PurePosixPath, agent: PurePosixPath, files: Collection[str
     return path.parent.parent == agent.parent and path.name == "vecnormalize.pkl" and own
 
 
-def check_whole(place: Place, data: bytes, described: "RepoSibling | None") -> None:
+def _check_whole(place: Place, data: bytes, described: "RepoSibling | None") -> None:
     """Refuse what a proxy or a broken connection made of a file: it would be kept for ever."""
     expected, found = None, None
     if described is not None and described.lfs is not None:
