@@ -244,12 +244,12 @@ def test_return_against_questions():
     assert files["queries.png"].startswith(b"\x89PNG")
     table = files["queries.md"].decode()
     expert = rows[0]["cell"]["expert"]
-    # 300 to act, 1,008 to calibrate, 3,000 probes: cloning asks 6,000 with 20, 24,000 with 80.
-    head = f"| {expert} | 10 probes | 1 | 4,308 |"
-    assert f"{head} +0.48 [+0.48, +0.48] | +0.42 [+0.42, +0.42] | +0.48 [+0.48, +0.48] |" in table
+    # 600 to act, 1,008 to calibrate, 6,000 probes: cloning asks 12,000 with 40, 24,000 with 80.
+    head = f"| {expert} | 10 probes | 2 | 7,608 |"
+    assert f"{head} +0.46 [+0.46, +0.46] | +0.42 [+0.42, +0.42] | +0.42 [+0.42, +0.42] |" in table
     assert f"{head} 0.50 [0.50, 0.50] |" in table
     assert f"| {expert} | 50 probes | 20 | 307,008 | asks less | asks less | asks less |" in table
-    assert f"| {expert} | DAgger | 5 | 1,500 |" in table
+    assert f"| {expert} | DAgger | 20 | 6,000 |" in table
     assert QUERIES.draw(rows[1:60]) == {}
 
 
