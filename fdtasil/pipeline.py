@@ -86,10 +86,10 @@ def distill(
             environment units. None with `demonstrations`: then nobody is asked.
         env: A gymnasium id (`module:Id` too), a gymnasium environment, or a function making one.
             None with `demonstrations`: then nothing is recorded or evaluated.
-        probes: The derivative source: 0 (plain behaviour cloning), N (N random directions for
-            each state, of states that can occur where those are few), "sphere:N" (N isotropic
-            directions for each state, asked once), "sphere:N,resample" (asked anew while
-            training), "orthogonal:N", "basis", "jacobian" (the analytic reference). Options
+        probes: The derivative source: 0 (plain behaviour cloning), N (N random directions at
+            each state; half of them lead towards other visited states where few of all
+            observations can occur), "sphere:N" (N isotropic directions at each state, asked
+            once), "sphere:N,resample" (asked anew while training), "orthogonal:N", "basis", "jacobian" (the analytic reference). Options
             after commas: forward, central, labels (the answers are labels of the moved states,
             and nothing is differenced), radius=R, raw, whitened, per_step=K. Radius and
             stencil that are left open are found by asking at a ladder of radii first.
