@@ -89,10 +89,11 @@ def distill(
         probes: The derivative source: 0 (plain behaviour cloning), N (N random directions at
             each state; half of them lead towards other visited states where few of all
             observations can occur), "sphere:N" (N isotropic directions at each state, asked
-            once), "sphere:N,resample" (asked anew while training), "orthogonal:N", "basis", "jacobian" (the analytic reference). Options
-            after commas: forward, central, labels (the answers are labels of the moved states,
-            and nothing is differenced), radius=R, raw, whitened, per_step=K. Radius and
-            stencil that are left open are found by asking at a ladder of radii first.
+            once), "sphere:N,resample" (asked anew while training), "orthogonal:N", "basis",
+            "jacobian" (the analytic reference). Options after commas: forward, central, labels
+            (the answers are labels of the moved states, and nothing is differenced), radius=R,
+            raw, whitened, per_step=K. Radius and stencil that are left open are found by
+            asking at a ladder of radii first.
         trainer: Who acts in which round: "bc" (the expert), "dagger" (a mixture of expert and
             student), "dart" (the expert with noise), or a trainer with settings of its own.
         episodes: Number of demonstrations.
