@@ -14,6 +14,7 @@ import torch
 from benchmarks.controllers import CONTROLLERS, available
 from benchmarks.runner import Benchmark, Cell, Row
 from fdtasil.answers import ask_probes
+from fdtasil.behaviours import follow
 from fdtasil.compute import torch_settings
 from fdtasil.demonstrations import Demonstrations
 from fdtasil.environments import EnvironmentPool
@@ -21,7 +22,7 @@ from fdtasil.experts import load_expert
 from fdtasil.fit import fit
 from fdtasil.presets import PRESETS
 from fdtasil.probes import Probes
-from fdtasil.rollouts import follow, rollout
+from fdtasil.rollouts import rollout
 from fdtasil.scales import statistics as scales_of
 from fdtasil.seeding import torch_generator
 from fdtasil.student import Student, StudentShape

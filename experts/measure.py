@@ -15,9 +15,10 @@ from pathlib import Path
 
 import torch
 
+from fdtasil.behaviours import follow
 from fdtasil.environments import EnvironmentPool
 from fdtasil.experts import load_expert
-from fdtasil.rollouts import follow, rollout
+from fdtasil.rollouts import rollout
 from fdtasil.seeding import episode_seeds
 
 HERE = Path(__file__).parent

@@ -17,9 +17,10 @@ import torch
 from actor import load_actor
 from measure import EPISODES, HERE, HORIZONS, MANIFEST, measure
 
+from fdtasil.behaviours import follow
 from fdtasil.environments import EnvironmentPool
 from fdtasil.onnx_files import export_module
-from fdtasil.rollouts import follow, rollout
+from fdtasil.rollouts import rollout
 from fdtasil.sb3 import read_agent
 from fdtasil.seeding import episode_seeds
 from fdtasil.storage import sha256, write_bytes

@@ -6,7 +6,7 @@ import numpy as np
 
 from fdtasil.errors import SettingError
 from fdtasil.experts import Expert
-from fdtasil.rollouts import Episodes
+from fdtasil.recording import Episodes
 
 __all__ = ["Demonstrations", "label"]
 

@@ -7,10 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from fdtasil.behaviours import Behaviour, Decision, Policy, follow
 from fdtasil.environments import EnvironmentPool
 from fdtasil.errors import EnvironmentFault, FdtasilWarning
 from fdtasil.experts import Expert
-from fdtasil.rollouts import Behaviour, Decision, Episodes, Policy, follow, rollout
+from fdtasil.recording import Episodes
+from fdtasil.rollouts import rollout
 from fdtasil.seeding import generator
 
 __all__ = [

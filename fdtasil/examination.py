@@ -4,13 +4,15 @@ import warnings
 
 import numpy as np
 
+from fdtasil.behaviours import Policy, follow
 from fdtasil.configuration import GATE_STATES
 from fdtasil.environments import EnvironmentPool
 from fdtasil.errors import FdtasilWarning
 from fdtasil.evaluation import Evaluation, check_episodes, compare
 from fdtasil.experts import Expert, check_expert
 from fdtasil.progress import Stages
-from fdtasil.rollouts import Episodes, Policy, first_observations, follow, rollout
+from fdtasil.recording import Episodes
+from fdtasil.rollouts import first_observations, rollout
 
 __all__ = ["examine", "judge"]
 

@@ -4,6 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
+from fdtasil.behaviours import follow
 from fdtasil.calibration import calibrate
 from fdtasil.configuration import check_count
 from fdtasil.environments import EnvironmentPool, resolve_horizon
@@ -12,7 +13,7 @@ from fdtasil.experts import load_expert
 from fdtasil.experts.gate import examine_expert
 from fdtasil.figures import draw_calibration
 from fdtasil.presets import PRESETS
-from fdtasil.rollouts import follow, rollout
+from fdtasil.rollouts import rollout
 from fdtasil.scales import statistics
 from fdtasil.seeding import episode_seeds, generator
 from fdtasil.shell import EnvironmentId, ExpertPath

@@ -2,12 +2,14 @@
 
 from dataclasses import dataclass, replace
 
+from fdtasil.behaviours import Behaviour
 from fdtasil.datasets import Dataset
 from fdtasil.demonstrations import label
 from fdtasil.environments import EnvironmentPool
 from fdtasil.evaluation import check_episodes
 from fdtasil.events import Event
-from fdtasil.rollouts import Behaviour, Episodes, rollout
+from fdtasil.recording import Episodes
+from fdtasil.rollouts import rollout
 from fdtasil.runstate import RunState
 from fdtasil.seeding import episode_seeds, generator
 from fdtasil.trainers import Situation

@@ -14,7 +14,7 @@ from fdtasil.datasets import Dataset
 from fdtasil.errors import SettingError
 from fdtasil.experts import Expert
 from fdtasil.probes import Probes
-from fdtasil.rollouts import Episodes
+from fdtasil.recording import Episodes
 from fdtasil.runfolder import RunFolder
 from fdtasil.scales import Statistics, statistics
 from fdtasil.seeding import generator

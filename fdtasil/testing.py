@@ -5,12 +5,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from fdtasil.behaviours import follow
 from fdtasil.environments import Boxes, EnvironmentLike, EnvironmentPool, resolve_horizon
 from fdtasil.errors import ExpertError, ExportError
 from fdtasil.evaluation import random_behaviour
 from fdtasil.experts import Expert, ExpertLike, Finding, examine_expert, load_expert
 from fdtasil.onnx_files import export_module
-from fdtasil.rollouts import Episodes, follow, rollout
+from fdtasil.recording import Episodes
+from fdtasil.rollouts import rollout
 from fdtasil.sb3 import Trust
 from fdtasil.seeding import episode_seeds, generator
 from fdtasil.student import Student

@@ -7,9 +7,10 @@ from typing import Literal, Protocol
 
 import numpy as np
 
+from fdtasil.behaviours import Behaviour, Decision, Policy
 from fdtasil.errors import SettingError
 from fdtasil.experts import Expert
-from fdtasil.rollouts import Behaviour, Decision, Episodes, Policy
+from fdtasil.recording import Episodes
 
 __all__ = [
     "TRAINERS",

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 
 from fdtasil.answers import Answers
+from fdtasil.behaviours import Policy
 from fdtasil.demonstrations import Demonstrations
 from fdtasil.errors import ExpertError, SettingError, shown
 from fdtasil.experts.hub import fetch, is_hub_uri
 from fdtasil.onnx_files import read_model
-from fdtasil.rollouts import Policy
 
 __all__ = ["COLUMNS", "StudentObservation", "View", "columns_of", "describe_view"]
 

@@ -18,10 +18,11 @@ from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Tu
 from toy_environments import Integrator
 
 import fdtasil
+from fdtasil.behaviours import follow
 from fdtasil.datasets import Dataset
 from fdtasil.environments import EnvironmentPool
 from fdtasil.errors import EnvironmentFault, FdtasilWarning, SettingError
-from fdtasil.rollouts import follow, rollout
+from fdtasil.rollouts import rollout
 from fdtasil.seeding import episode_seeds
 
 

@@ -47,6 +47,8 @@ ORDER = [
     "experts",
     "sb3",
     "rollouts",
+    "recording",
+    "behaviours",
     "environments",
     "onnx_files",
     "limits",

@@ -6,9 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from fdtasil.behaviours import follow
 from fdtasil.environments import EnvironmentPool
 from fdtasil.experts import load_expert
-from fdtasil.rollouts import Episodes, follow, rollout
+from fdtasil.recording import Episodes
+from fdtasil.rollouts import rollout
 from fdtasil.seeding import episode_seeds
 
 SHIPPED = Path(__file__).parents[2] / "experts"

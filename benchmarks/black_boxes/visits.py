@@ -4,9 +4,10 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from fdtasil.behaviours import Behaviour, Decision
 from fdtasil.environments import EnvironmentPool
 from fdtasil.experts import Expert, load_expert
-from fdtasil.rollouts import Behaviour, Decision, rollout
+from fdtasil.rollouts import rollout
 from fdtasil.seeding import episode_seeds, generator
 
 from .box import SHIPPED

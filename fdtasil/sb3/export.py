@@ -7,10 +7,11 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
+from fdtasil.behaviours import follow
 from fdtasil.environments import EnvironmentLike, EnvironmentPool
 from fdtasil.errors import ExpertError, SettingError
 from fdtasil.onnx_files import export_module
-from fdtasil.rollouts import follow, rollout
+from fdtasil.rollouts import rollout
 from fdtasil.sb3.agent import Agent, read_agent
 from fdtasil.sb3.statistics import Trust, VecNormalizePath
 from fdtasil.storage import write_bytes
