@@ -77,6 +77,8 @@ class Recording:
         self.terminated = np.zeros(episodes, bool)
         self.physics_resets = np.zeros(episodes, np.int64)
         self.clipped_actions = 0
+        # Of MuJoCo's simulations, None elsewhere; asking an environment for it takes a while.
+        self._data: list[object] = [None] * episodes
 
     def reset(self, environment: gymnasium.Env, episode: int) -> np.ndarray:
         """Return the first observation of an episode."""
@@ -84,13 +86,14 @@ class Recording:
             observation, _ = environment.reset(seed=self._seeds[episode])
         except Exception as error:
             raise self._crash(episode, None, "reset()", error) from error
+        self._data[episode] = getattr(environment.unwrapped, "data", None)
         return observation
 
     def step(
         self, environment: gymnasium.Env, action: np.ndarray, episode: int, step: int
     ) -> tuple[np.ndarray, bool]:
         """Record a step's outcome; return the observation and whether the episode goes on."""
-        data = getattr(environment.unwrapped, "data", None)
+        data = self._data[episode]
         before = _clock(data)
         try:
             answer = environment.step(action)
