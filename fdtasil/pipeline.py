@@ -145,6 +145,7 @@ def distill(
         StorageError: If the run's folder can't be written.
 
     Example:
+        >>> import numpy as np
         >>> result = distill(
         ...     lambda x: np.clip(-8 * np.arctan2(x[:, 1:2], x[:, :1]) - 2 * x[:, 2:], -2, 2),
         ...     "Pendulum-v1", probes=4, episodes=2, horizon=50, steps=50, hidden=16,
@@ -266,6 +267,7 @@ def evaluate(
         EnvironmentFault: If the environment can't be used, or misbehaves.
 
     Example:
+        >>> import numpy as np
         >>> def swing(observations):
         ...     cosine, sine, speed = observations.T
         ...     return np.clip(-8 * np.arctan2(sine, cosine) - 2 * speed, -2, 2)[:, None]
