@@ -132,6 +132,8 @@ def _differences(curves: Mapping[str, Curves]) -> str:
             points = of_expert[method][count]
             scores = {seed: score for seed, (_, score) in points.items()}
             rivals = [_at_no_less(of_expert, (method, count), rival) for rival in RIVALS]
+            if not any(rivals):
+                continue
             texts = [
                 difference_text(*paired_difference(scores, theirs)) if theirs else "asks less"
                 for theirs in rivals
