@@ -152,10 +152,10 @@ def _picture(curves: Mapping[str, Curves]) -> bytes:
     experts = {
         expert: {
             LABELS[method]: {
-                _asked(points): [score for _, score in points.values()]
-                for points in of_expert[method].values()
+                _asked(of_expert[method][count]): [s for _, s in of_expert[method][count].values()]
+                for count in counts
             }
-            for method in BUDGETS
+            for method, counts in BUDGETS.items()
         }
         for expert, of_expert in curves.items()
     }
