@@ -1,7 +1,7 @@
 """Paired evaluation: student and expert from the same starts, with an interval."""
 
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +11,7 @@ from fdtasil.behaviours import Behaviour, Decision, Policy, follow
 from fdtasil.environments import EnvironmentPool
 from fdtasil.errors import EnvironmentFault, FdtasilWarning
 from fdtasil.experts import Expert
+from fdtasil.progress import Stages
 from fdtasil.recording import Episodes
 from fdtasil.rollouts import rollout
 from fdtasil.seeding import generator
@@ -105,7 +106,7 @@ def compare(
     pool: EnvironmentPool,
     horizon: int,
     seed: int,
-    on_step: Callable[[int], None] = lambda count: None,
+    stages: Stages,
 ) -> Evaluation:
     """Run a policy from the starts of the expert's episodes, and compare.
 
@@ -116,10 +117,11 @@ def compare(
         pool: The environment.
         horizon: T.
         seed: Of the bootstrap, and of the random actions where they are the reference.
-        on_step: Told of environment steps.
+        stages: Progress bars.
     """
     seeds = [int(s) for s in expert_episodes.seeds]
-    student_episodes = rollout(follow(student), pool, seeds, horizon, on_step=on_step)
+    with stages.stage("evaluation", len(seeds) * horizon, "step") as move:
+        student_episodes = rollout(follow(student), pool, seeds, horizon, on_step=move)
     reference = _reference_return(expert_episodes, pool, seeds, horizon, seed)
     ours, theirs = student_episodes.returns, expert_episodes.returns
     meaningful = float(theirs.mean()) > reference

@@ -1,20 +1,18 @@
-"""What an expert goes through before it teaches, and a student after it has learnt."""
+"""What an expert goes through before it teaches."""
 
 import warnings
 
-import numpy as np
-
-from fdtasil.behaviours import Policy, follow
+from fdtasil.behaviours import follow
 from fdtasil.configuration import GATE_STATES
 from fdtasil.environments import EnvironmentPool
 from fdtasil.errors import FdtasilWarning
-from fdtasil.evaluation import Evaluation, check_episodes, compare
+from fdtasil.evaluation import check_episodes
 from fdtasil.experts import Expert, check_expert
 from fdtasil.progress import Stages
 from fdtasil.recording import Episodes
 from fdtasil.rollouts import first_observations, rollout
 
-__all__ = ["examine", "judge"]
+__all__ = ["examine"]
 
 _LONG = 600.0  # seconds of questions that are announced
 
@@ -55,9 +53,7 @@ def examine(
         behaviour = follow(expert.policy("evaluate"))
         episodes = rollout(behaviour, pool, starts, horizon, on_step=move)
     check_episodes(episodes, pool.name)
-    visited = episodes.observations[episodes.valid]
-    spread = np.linspace(0, len(visited) - 1, GATE_STATES).astype(int)
-    check_expert(expert, visited[spread], pool.boxes, force=force)
+    check_expert(expert, episodes.spread(GATE_STATES), pool.boxes, force=force)
     return episodes
 
 
@@ -71,18 +67,3 @@ def _announce(seconds: float, rows: int) -> None:
             FdtasilWarning,
             stacklevel=5,
         )
-
-
-def judge(
-    student: Policy,
-    expert: Expert,
-    expert_episodes: Episodes,
-    pool: EnvironmentPool,
-    horizon: int,
-    seed: int,
-    stages: Stages,
-) -> Evaluation:
-    """Compare a student with the expert's episodes, under a progress bar; see `compare`."""
-    total = len(expert_episodes.seeds) * horizon
-    with stages.stage("evaluation", total, "step") as move:
-        return compare(student, expert, expert_episodes, pool, horizon, seed, move)

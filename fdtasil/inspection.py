@@ -2,8 +2,6 @@
 
 from pathlib import Path
 
-import numpy as np
-
 from fdtasil.behaviours import follow
 from fdtasil.calibration import calibrate
 from fdtasil.configuration import check_count
@@ -21,7 +19,7 @@ from fdtasil.storage import write_bytes
 
 __all__ = ["inspect_expert"]
 
-
+_STATES = 32
 _CHANCE = "  (no worse than the expert: does it belong to this environment and version?)"
 
 
@@ -56,8 +54,7 @@ def inspect_expert(
         noise = [generator(seed, "random actions", episode) for episode in range(episodes)]
         chance = rollout(random_behaviour(pool), pool, starts, length, noise).returns.mean()
         visited = recorded.observations[recorded.valid]
-        spread = np.linspace(0, len(visited) - 1, 32).astype(int)
-        findings = examine_expert(opened, visited[spread], boxes)
+        findings = examine_expert(opened, recorded.spread(_STATES), boxes)
         usual = PRESETS["standard"].radius
         random = generator(seed, "calibration")
         found = calibrate(opened, visited, statistics(visited), random, usual)

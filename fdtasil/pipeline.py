@@ -10,9 +10,9 @@ from fdtasil.configuration import Configuration, check_count
 from fdtasil.datasets import DatasetLike, load_dataset
 from fdtasil.distilled import Distilled
 from fdtasil.environments import EnvironmentLike, EnvironmentPool, resolve_horizon
-from fdtasil.evaluation import Evaluation
+from fdtasil.evaluation import Evaluation, compare
 from fdtasil.events import Callback, Event, tell_all
-from fdtasil.examination import examine, judge
+from fdtasil.examination import examine
 from fdtasil.experts import ExpertLike, load_expert
 from fdtasil.interrupts import heard_interrupts
 from fdtasil.presets import preset_of
@@ -286,7 +286,7 @@ def evaluate(
         view = View.of(seen, theirs.observations[theirs.valid][:256])
         student = load_expert(policy, view.size, m)
         answer = view.policy(student.policy("evaluate"))
-        return judge(answer, black_box, theirs, pool, length, seed, stages)
+        return compare(answer, black_box, theirs, pool, length, seed, stages)
 
 
 def _go(training: Training, subject: Subject, notes: list[str], *, force: bool) -> Distilled:
@@ -304,7 +304,7 @@ def _go(training: Training, subject: Subject, notes: list[str], *, force: bool) 
         seconds, student, evaluation = time.perf_counter() - started, state.trained, None
         if expert is not None and pool is not None and theirs is not None:
             policy = state.view.policy(student.act)
-            evaluation = judge(policy, expert, theirs, pool, run.horizon, run.seed, stages)
+            evaluation = compare(policy, expert, theirs, pool, run.horizon, run.seed, stages)
             last = state.history[-1]
             about = int(last["round"]), state.steps, last
             training.callback(Event("evaluation", *about, student, evaluation))

@@ -54,6 +54,14 @@ class Episodes:
         """(E,) undiscounted sum of rewards of each episode."""
         return self.rewards.sum(axis=1)
 
+    def spread(self, count: int) -> np.ndarray:
+        """Return (count, n) of the visited states, evenly spread over all of them in order.
+
+        Where fewer were visited, some are returned several times.
+        """
+        visited = self.observations[self.valid]
+        return visited[np.linspace(0, len(visited) - 1, count).astype(int)]
+
 
 class Recording:
     """The arrays of `Episodes` while they are being filled.

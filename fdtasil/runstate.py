@@ -41,7 +41,8 @@ class RunState:
         episodes: Number of episodes recorded so far.
         counts: Clipped actions, physics resets and falls of the recorded episodes.
         calibration: What was found about the expert in the first round, or None.
-        source: The derivative source, with what the calibration found filled in.
+        source: The derivative source, with what the calibration found filled in; kept, for filling
+            it in warns of a radius that misleads.
         again: Rows asked before a checkpoint was taken up, which the interrupted run has asked
             and counted too; None in a run that was not interrupted.
     """

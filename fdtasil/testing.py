@@ -98,7 +98,7 @@ def check_student(
         looked = _look(student, pool, horizon, seed)
         if looked.own is None or looked.expert is None:
             return looked.findings
-        states = _spread(looked.own)
+        states = looked.own.spread(_STATES)
         findings = [*looked.findings, _far(looked.expert, states, pool.boxes)]
     return [*findings, _export(student, states)] if isinstance(student, Student) else findings
 
@@ -132,15 +132,9 @@ def _look(
         own = rollout(follow(opened.policy("act")), pool, starts, length)
     except ExpertError as error:
         return _Looked([opening, Finding("answers", error.found, error)])
-    states = _spread(own)
+    states = own.spread(_STATES)
     examined = [*examine_expert(opened, states, boxes), _batch_sizes(opened, states)]
     return _Looked([opening, *examined], opened, own)
-
-
-def _spread(episodes: Episodes) -> np.ndarray:
-    """Return (32, n) of the visited states."""
-    visited = episodes.observations[episodes.valid]
-    return visited[np.linspace(0, len(visited) - 1, _STATES).astype(int)]
 
 
 def _batch_sizes(expert: Expert, states: np.ndarray) -> Finding:
