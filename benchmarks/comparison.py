@@ -5,6 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 from benchmarks.panels import SHARE, draw_panels
 from benchmarks.runner import Row
 from benchmarks.statistics import difference_text, interval_text, paired_difference
+from benchmarks.tables import table
 
 __all__ = ["Column", "Scores", "differences_table", "draw_scores", "scores_of", "scores_table"]
 
@@ -39,27 +40,26 @@ def scores_of(rows: Sequence[Row], methods: Sequence[str], seeds: int) -> Scores
 
 def scores_table(scores: Scores, methods: Sequence[str], across: str = TRAJECTORIES) -> str:
     """Return a table of interquartile means with their 95 % intervals, one line a group."""
-    lines = _head([across, *methods])
-    for (expert, column), group in scores.items():
-        texts = [interval_text(list(group[method].values())) for method in methods]
-        lines.append(f"| {expert} | {column} | {' | '.join(texts)} |")
-    return "\n".join(lines) + "\n"
+    rows = (
+        [
+            expert,
+            str(column),
+            *(interval_text(list(group[method].values())) for method in methods),
+        ]
+        for (expert, column), group in scores.items()
+    )
+    return table(["expert", across, *methods], rows)
 
 
 def differences_table(
     scores: Scores, pairs: Sequence[tuple[str, str]], across: str = TRAJECTORIES
 ) -> str:
     """Return a table of mean differences on equal seeds, ours - theirs, with 95 % intervals."""
-    lines = _head([across, *(f"{ours} - {theirs}" for ours, theirs in pairs)])
+    rows = []
     for (expert, column), group in scores.items():
         found = [paired_difference(group[ours], group[theirs]) for ours, theirs in pairs]
-        texts = [difference_text(*difference) for difference in found]
-        lines.append(f"| {expert} | {column} | {' | '.join(texts)} |")
-    return "\n".join(lines) + "\n"
-
-
-def _head(columns: Sequence[str]) -> list[str]:
-    return [f"| expert | {' | '.join(columns)} |", "|---" * (len(columns) + 1) + "|"]
+        rows.append([expert, str(column), *(difference_text(*difference) for difference in found)])
+    return table(["expert", across, *(f"{ours} - {theirs}" for ours, theirs in pairs)], rows)
 
 
 def draw_scores(

@@ -7,7 +7,9 @@ import fdtasil
 from benchmarks.controllers import CONTROLLERS
 from benchmarks.runner import Benchmark, Cell, Row
 
-__all__ = ["distillations"]
+__all__ = ["HORIZON", "distillations", "usual_arguments"]
+
+HORIZON = 300
 
 
 def distillations(
@@ -32,6 +34,11 @@ def distillations(
         return _distil(**arguments(cell))
 
     return Benchmark(name, about, cells, run, draw, arguments=arguments)
+
+
+def usual_arguments(cell: Cell) -> dict[str, Any]:
+    """Return the arguments that a cell gives by its names: expert, trajectories and seed."""
+    return {name: cell[name] for name in ("expert", "episodes", "seed")} | {"horizon": HORIZON}
 
 
 def _distil(expert: str, **arguments: Any) -> dict[str, Any]:

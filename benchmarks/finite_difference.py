@@ -5,14 +5,13 @@ from typing import Any
 
 from benchmarks.comparison import differences_table, draw_scores, scores_of, scores_table
 from benchmarks.controllers import available
-from benchmarks.distillation import distillations
+from benchmarks.distillation import distillations, usual_arguments
 from benchmarks.runner import Cell, Row
 
-__all__ = ["FINITE_DIFFERENCE", "HORIZON", "LABELS", "METHODS", "SEEDS", "experts"]
+__all__ = ["FINITE_DIFFERENCE", "SEEDS", "STANDARD_METHODS", "experts", "label"]
 
 ENVIRONMENTS = ("Walker2d", "HalfCheetah", "Ant", "Humanoid")
 SEEDS = range(5)
-HORIZON = 300
 
 PRESETS: dict[str, dict[str, Any]] = {
     # What a user gets who sets nothing.
@@ -32,14 +31,15 @@ GRID = (
     ("standard", 10),
     ("standard", 50),
 )
+STANDARD_METHODS: dict[str, dict[str, Any]] = {
+    "plain": {"probes": 0},
+    "jacobian": {"probes": "jacobian"},
+    **{str(count): {"probes": count} for count in (1, 5, 10, 50)},
+    # A moved state's label counts as much as a visited state's.
+    "augmentation": {"probes": "adaptive:10,labels", "weight": 1.0},
+}
 METHODS: dict[str, dict[str, dict[str, Any]]] = {
-    "standard": {
-        "plain": {"probes": 0},
-        "jacobian": {"probes": "jacobian"},
-        **{str(count): {"probes": count} for count in (1, 5, 10, 50)},
-        # A moved state's label counts as much as a visited state's.
-        "augmentation": {"probes": "adaptive:10,labels", "weight": 1.0},
-    },
+    "standard": STANDARD_METHODS,
     "paper": {
         "plain": {"probes": 0},
         "jacobian": {"probes": "jacobian,per_step=1"},
@@ -69,24 +69,22 @@ def experts() -> list[str]:
 def arguments(cell: Cell) -> dict[str, Any]:
     """Return the cell's method, with its preset."""
     preset, method = cell["preset"], cell["method"]
-    return {
-        "expert": cell["expert"],
-        "episodes": cell["episodes"],
-        "seed": cell["seed"],
-        "horizon": HORIZON,
-        **PRESETS[preset],
-        **METHODS[preset][method],
-    }
+    return usual_arguments(cell) | PRESETS[preset] | METHODS[preset][method]
 
 
 # The appendix's claims, and the rival: ours - theirs on equal seeds.
 PAIRS = (("1", "jacobian"), ("10", "jacobian"), ("10", "1"), ("50", "1"), ("10", "augmentation"))
-LABELS = {
+_LABELS = {
     "plain": "plain cloning",
     "jacobian": "analytic Jacobian",
     "1": "1 probe",
     "augmentation": "10 answers as labels",
 }
+
+
+def label(method: str) -> str:
+    """Return what figures call a method; a number is one of probes."""
+    return _LABELS.get(method, f"{method} probes" if method.isdigit() else method)
 
 
 def draw(rows: Sequence[Row]) -> dict[str, bytes]:
@@ -97,7 +95,7 @@ def draw(rows: Sequence[Row]) -> dict[str, bytes]:
         scores = scores_of(mine, list(methods), len(SEEDS))
         if not scores:
             continue
-        picture = draw_scores(scores, list(methods), lambda m: LABELS.get(m, f"{m} probes"))
+        picture = draw_scores(scores, list(methods), label)
         files[f"finite_difference_{preset}.png"] = picture
         text += f"## Preset `{preset}`\n\n{scores_table(scores, list(methods))}\n"
         text += f"Differences on equal seeds:\n\n{differences_table(scores, PAIRS)}\n"

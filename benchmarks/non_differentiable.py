@@ -10,6 +10,7 @@ import fdtasil
 from benchmarks.black_boxes import BLACK_BOXES
 from benchmarks.runner import Benchmark, Cell, Row
 from benchmarks.statistics import interval_text
+from benchmarks.tables import table
 
 __all__ = ["NON_DIFFERENTIABLE"]
 
@@ -60,22 +61,21 @@ def run(cell: Cell) -> dict[str, Any]:
 
 def draw(rows: Sequence[Row]) -> dict[str, bytes]:
     """One table: kinds down, plain cloning and probes across."""
-    lines = [
-        "| expert | environment | expert's return | plain cloning | 10 probes | worst seed "
-        "| questions to learn from | seconds, plain and with probes | probes |",
-        "|---|---|---|---|---|---|---|---|---|",
-    ]
+    heads = ["expert", "environment", "expert's return", "plain cloning", "10 probes"]
+    heads += ["worst seed", "questions to learn from", "seconds, plain and with probes", "probes"]
+    lines: list[list[str]] = []
     for kind in BLACK_BOXES:
         mine = [row for row in rows if row["cell"]["black_box"] == kind]
         lines += _line(kind, *(_results(mine, probes) for probes in PROBES))
-    return {"non_differentiable.md": ("\n".join(lines) + "\n").encode()}
+    return {"non_differentiable.md": table(heads, lines).encode()}
 
 
 def _results(rows: Sequence[Row], probes: int) -> list[dict[str, Any]]:
     return [row["result"] for row in rows if row["cell"]["probes"] == probes]
 
 
-def _line(kind: str, ours: list[dict[str, Any]], plain: list[dict[str, Any]]) -> list[str]:
+def _line(kind: str, ours: list[dict[str, Any]], plain: list[dict[str, Any]]) -> list[list[str]]:
+    """Return the line of a kind, or none where a side of it is not there yet."""
     if not ours or not plain:
         return []
     scores, base = ([r["normalized_return"] for r in results] for results in (ours, plain))
@@ -84,11 +84,9 @@ def _line(kind: str, ours: list[dict[str, Any]], plain: list[dict[str, Any]]) ->
     seconds = [_mean([r["seconds"] for r in results]) for results in (plain, ours)]
     sources = ", ".join(dict.fromkeys(r["probes"] for r in ours))
     best = _mean([r["expert_return"] for r in ours])
-    return [
-        f"| {kind} | {BLACK_BOXES[kind].environment} | {best:.4g} "
-        f"| {interval_text(base)} | {interval_text(scores)} | {min(scores):.2f} "
-        f"| {asked:,.0f} | {seconds[0]:.0f}, {seconds[1]:.0f} | {sources} |"
-    ]
+    cells = [kind, BLACK_BOXES[kind].environment, f"{best:.4g}"]
+    cells += [interval_text(base), interval_text(scores), f"{min(scores):.2f}"]
+    return [[*cells, f"{asked:,.0f}", f"{seconds[0]:.0f}, {seconds[1]:.0f}", sources]]
 
 
 def _mean(values: Sequence[float]) -> float:

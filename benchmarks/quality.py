@@ -6,6 +6,7 @@ from benchmarks.controllers import available
 from benchmarks.distillation import distillations
 from benchmarks.runner import Cell, Row
 from benchmarks.statistics import difference_text, interval_text, paired_difference
+from benchmarks.tables import table
 
 __all__ = ["QUALITY"]
 
@@ -29,11 +30,9 @@ def cells(quick: bool) -> list[Cell]:
 
 def draw(rows: Sequence[Row]) -> dict[str, bytes]:
     """One table: experts and budgets down, plain cloning and probes across."""
-    lines = [
-        "| expert | episodes x steps | plain cloning | 10 probes | paired difference, 95 % "
-        "| worst seed | survival, expert and student | seconds |",
-        "|---|---|---|---|---|---|---|---|",
-    ]
+    heads = ["expert", "episodes x steps", "plain cloning", "10 probes"]
+    heads += ["paired difference, 95 %", "worst seed", "survival, expert and student", "seconds"]
+    lines: list[list[str]] = []
     experts = list(dict.fromkeys(row["cell"]["expert"] for row in rows))
     for episodes, horizon in BUDGETS:
         for expert in experts:
@@ -43,11 +42,12 @@ def draw(rows: Sequence[Row]) -> dict[str, bytes]:
                 if (row["cell"]["expert"], row["cell"]["episodes"], row["cell"]["horizon"])
                 == (expert, episodes, horizon)
             ]
-            lines += _line(mine, f"{expert} | {episodes} x {horizon}")
-    return {"quality.md": ("\n".join(lines) + "\n").encode()}
+            lines += _line(mine, [expert, f"{episodes} x {horizon}"])
+    return {"quality.md": table(heads, lines).encode()}
 
 
-def _line(rows: Sequence[Row], head: str) -> list[str]:
+def _line(rows: Sequence[Row], head: list[str]) -> list[list[str]]:
+    """Return the line of an expert and budget, or none where two seeds are not there yet."""
     by_probes = {
         probes: {
             row["cell"]["seed"]: row["result"] for row in rows if row["cell"]["probes"] == probes
@@ -65,11 +65,10 @@ def _line(rows: Sequence[Row], head: str) -> list[str]:
         for name in ("expert_survival", "survival")
     ]
     seconds = sum(result["train_seconds"] for result in ours.values()) / len(ours)
-    return [
-        f"| {head} | {interval_text(list(base.values()))} | {interval_text(list(score.values()))} "
-        f"| {difference_text(*difference, 3)} | {min(score.values()):.2f} "
-        f"| {survival[0]:.2f}, {survival[1]:.2f} | {seconds:.0f} |"
-    ]
+    cells = [interval_text(list(base.values())), interval_text(list(score.values()))]
+    cells += [difference_text(*difference, 3), f"{min(score.values()):.2f}"]
+    cells += [f"{survival[0]:.2f}, {survival[1]:.2f}", f"{seconds:.0f}"]
+    return [[*head, *cells]]
 
 
 QUALITY = distillations("quality", __doc__ or "", cells, dict, draw)

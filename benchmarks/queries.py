@@ -5,11 +5,12 @@ from typing import Any
 
 import numpy as np
 
-from benchmarks.distillation import distillations
-from benchmarks.finite_difference import HORIZON, SEEDS, experts
+from benchmarks.distillation import distillations, usual_arguments
+from benchmarks.finite_difference import SEEDS, STANDARD_METHODS, experts, label
 from benchmarks.panels import draw_panels
 from benchmarks.runner import Cell, Row
 from benchmarks.statistics import difference_text, interval_text, paired_difference
+from benchmarks.tables import table
 
 __all__ = ["QUERIES"]
 
@@ -23,23 +24,20 @@ BUDGETS: dict[str, tuple[int, ...]] = {
     "50": (2, 5, 20),
 }
 METHODS: dict[str, dict[str, Any]] = {
-    "plain": {"probes": 0},
+    **STANDARD_METHODS,
     # Many states are each seen seldom in the usual 4,000 steps: is that what holds cloning back?
     "plain, longer": {"probes": 0, "steps": 12_000},
     "dagger": {"trainer": "dagger", "probes": 0},
-    **{count: {"probes": int(count)} for count in ("1", "10", "50")},
 }
-LABELS = {
-    "plain": "plain cloning",
+LABELS = {method: label(method) for method in BUDGETS} | {
     "plain, longer": "plain cloning, three times the steps",
     "dagger": "DAgger",
-    "1": "1 probe",
-    "10": "10 probes",
-    "50": "50 probes",
 }
 RIVALS = ("plain", "plain, longer", "dagger")
 # The answers that a student learns from; the gate's and the evaluation's are asked of all.
 PURPOSES = ("act", "label", "calibrate", "probe")
+
+_HEADS = ("expert", "method", "trajectories", "questions")
 
 Curves = Mapping[str, Mapping[int, Mapping[int, tuple[int, float]]]]
 """method -> trajectories -> seed -> (questions, score)."""
@@ -58,8 +56,7 @@ def cells(quick: bool) -> list[Cell]:
 
 def arguments(cell: Cell) -> dict[str, Any]:
     """Return the cell's method; the rest are defaults."""
-    settings = {"expert": cell["expert"], "episodes": cell["episodes"], "seed": cell["seed"]}
-    return {**settings, "horizon": HORIZON, **METHODS[cell["method"]]}
+    return usual_arguments(cell) | METHODS[cell["method"]]
 
 
 def draw(rows: Sequence[Row]) -> dict[str, bytes]:
@@ -109,28 +106,30 @@ def _asked(points: Mapping[int, tuple[int, float]]) -> float:
 
 
 def _scores(curves: Mapping[str, Curves]) -> str:
-    lines = ["| expert | method | trajectories | questions | return |", "|---|---|---|---|---|"]
+    rows = []
     for expert, of_expert in curves.items():
         for method, counts in BUDGETS.items():
             for count in counts:
-                points = of_expert[method][count]
-                score = interval_text([score for _, score in points.values()])
-                head = f"| {expert} | {LABELS[method]} | {count} | {_asked(points):,.0f} "
-                lines.append(f"{head}| {score} |")
-    return "\n".join(lines) + "\n"
+                score = interval_text(_returns(of_expert[method][count]))
+                rows.append([*_head(expert, of_expert, method, count), score])
+    return table([*_HEADS, "return"], rows)
+
+
+def _head(expert: str, curves: Curves, method: str, count: int) -> list[str]:
+    """Return the cells that a line of either table begins with."""
+    return [expert, LABELS[method], str(count), f"{_asked(curves[method][count]):,.0f}"]
+
+
+def _returns(points: Mapping[int, tuple[int, float]]) -> list[float]:
+    return [score for _, score in points.values()]
 
 
 def _differences(curves: Mapping[str, Curves]) -> str:
     """Return a table of paired differences, ours - a rival's who asks no less."""
-    heads = [f"- {LABELS[rival]}" for rival in RIVALS]
-    lines = [
-        f"| expert | method | trajectories | questions | {' | '.join(heads)} |",
-        "|---|---|---|---|" + "---|" * len(heads),
-    ]
+    rows = []
     for expert, of_expert in curves.items():
         for method, count in _ours():
-            points = of_expert[method][count]
-            scores = {seed: score for seed, (_, score) in points.items()}
+            scores = {seed: score for seed, (_, score) in of_expert[method][count].items()}
             rivals = [_at_no_less(of_expert, (method, count), rival) for rival in RIVALS]
             if not any(rivals):
                 continue
@@ -138,9 +137,8 @@ def _differences(curves: Mapping[str, Curves]) -> str:
                 difference_text(*paired_difference(scores, theirs)) if theirs else "asks less"
                 for theirs in rivals
             ]
-            head = f"| {expert} | {LABELS[method]} | {count} | {_asked(points):,.0f} "
-            lines.append(f"{head}| {' | '.join(texts)} |")
-    return "\n".join(lines) + "\n"
+            rows.append([*_head(expert, of_expert, method, count), *texts])
+    return table([*_HEADS, *(f"- {LABELS[rival]}" for rival in RIVALS)], rows)
 
 
 def _ours() -> list[tuple[str, int]]:
@@ -152,7 +150,7 @@ def _picture(curves: Mapping[str, Curves]) -> bytes:
     experts = {
         expert: {
             LABELS[method]: {
-                _asked(of_expert[method][count]): [s for _, s in of_expert[method][count].values()]
+                _asked(of_expert[method][count]): _returns(of_expert[method][count])
                 for count in counts
             }
             for method, counts in BUDGETS.items()

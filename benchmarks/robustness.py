@@ -10,8 +10,9 @@ import numpy as np
 import fdtasil
 from benchmarks.comparison import Column, Scores, differences_table, draw_scores, scores_table
 from benchmarks.controllers import CONTROLLERS
+from benchmarks.distillation import HORIZON
 from benchmarks.disturbances import DISTURBANCES, STEPS_BETWEEN_PUSHES, Disturbance
-from benchmarks.finite_difference import HORIZON, LABELS, METHODS, SEEDS, experts
+from benchmarks.finite_difference import SEEDS, STANDARD_METHODS, experts, label
 from benchmarks.runner import Benchmark, Cell, Row
 
 __all__ = ["ROBUSTNESS"]
@@ -49,7 +50,7 @@ def cells(quick: bool) -> list[Cell]:
 def run(cell: Cell) -> dict[str, Any]:
     """Distil in the usual environment, and compare with the expert in every disturbed one."""
     return compare_under_disturbances(
-        cell["expert"], cell["seed"], METHODS["standard"][cell["method"]]
+        cell["expert"], cell["seed"], STANDARD_METHODS[cell["method"]]
     )
 
 
@@ -113,7 +114,7 @@ def draw(rows: Sequence[Row]) -> dict[str, bytes]:
     picture = draw_scores(
         scores,
         COLUMNS,
-        lambda method: LABELS.get(method, f"{method} probes"),
+        label,
         across="",
         score="return, share of the undisturbed expert's",
     )

@@ -97,10 +97,11 @@ def run(
     if path.exists() and not path.read_text().endswith("\n"):
         with path.open("a") as file:
             file.write("\n")  # a kill cut the last line short: leave it to itself
-    reused = _reused(benchmark, due, known or {})
+    about = {"commit": _commit(), "versions": versions()}
+    here = {"versions": about["versions"], "machine": _machine()}
+    reused = _reused(benchmark, due, known or {}, here)
     due = [cell for cell in due if _key(cell) not in reused]
     failed = []
-    about = {"commit": _commit(), "versions": versions()}
     with path.open("a") as file:
         file.writelines(json.dumps(row) + "\n" for row in reused.values())
         file.flush()
@@ -150,12 +151,14 @@ def results_of(rows: Iterable[Row]) -> list[Row]:
 
 
 def _reused(
-    benchmark: Benchmark, cells: Sequence[Cell], known: Mapping[str, Row]
+    benchmark: Benchmark,
+    cells: Sequence[Cell],
+    known: Mapping[str, Row],
+    here: Mapping[str, object],
 ) -> dict[str, Row]:
     """Return the rows of those cells whose distillation another benchmark has run here."""
     if benchmark.arguments is None:
         return {}
-    here = {"versions": versions(), "machine": _machine()}
     return {
         _key(cell): {**row, "cell": dict(cell)}
         for cell in cells

@@ -13,6 +13,7 @@ import torch
 
 from benchmarks.controllers import CONTROLLERS, available
 from benchmarks.runner import Benchmark, Cell, Row
+from benchmarks.tables import table
 from fdtasil.answers import ask_probes
 from fdtasil.behaviours import follow
 from fdtasil.compute import torch_settings
@@ -181,7 +182,7 @@ _MEASURES = {"step": _step, "asking": _asking, "stepping": _stepping}
 
 def draw(rows: Sequence[Row]) -> dict[str, bytes]:
     """One table of ratios, each pair by pair: minimum and median."""
-    lines = ["| what | of | ratio, minimum | median |", "|---|---|---|---|"]
+    lines: list[list[str]] = []
     for row in rows:
         cell, result = row["cell"], row["result"]
         if cell["what"] == "step":
@@ -200,13 +201,13 @@ def draw(rows: Sequence[Row]) -> dict[str, bytes]:
                 _line(f"rollout, {cell['expert']}", "env.step", times["ours"], times["bare"])
             )
     machines = sorted({row["machine"] for row in rows})
-    text = "\n".join([*lines, "", f"One thread. {', '.join(machines)}."])
-    return {"speed.md": (text + "\n").encode()}
+    text = table(["what", "of", "ratio, minimum", "median"], lines)
+    return {"speed.md": f"{text}\nOne thread. {', '.join(machines)}.\n".encode()}
 
 
-def _line(what: str, of: str, ours: Sequence[float], theirs: Sequence[float]) -> str:
+def _line(what: str, of: str, ours: Sequence[float], theirs: Sequence[float]) -> list[str]:
     ratios = [a / b for a, b in zip(ours, theirs, strict=True)]
-    return f"| {what} | {of} | {min(ratios):.2f} | {statistics.median(ratios):.2f} |"
+    return [what, of, f"{min(ratios):.2f}", f"{statistics.median(ratios):.2f}"]
 
 
 SPEED = Benchmark("speed", __doc__ or "", cells, measure, draw, alone=True)

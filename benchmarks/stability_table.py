@@ -7,6 +7,7 @@ import numpy as np
 
 from benchmarks.runner import Row
 from benchmarks.statistics import interval
+from benchmarks.tables import table
 
 __all__ = ["NAMES", "STARTS", "THRESHOLDS", "Results", "breaks_at", "draw_table", "grouped"]
 
@@ -69,24 +70,23 @@ def breaks_at(result: dict[str, Any], starts: str, quantity: str) -> float:
 def draw_table(rows: Sequence[Row]) -> bytes:
     """Three tables: gaps by nu, where each order breaks, finite differences against analytic."""
     groups, shown = grouped(rows), [f"nu = {text}" for text in _SHOWN.values()]
-    lines = [_GAPS, *_head("p", "derivatives", "starts", *shown, "seconds")]
-    for starts in STARTS:
-        lines += [_gaps(key, results, rows, starts) for key, results in groups.items()]
     columns = [f"{starts}, {name}" for starts in STARTS for name in _QUANTITIES.values()]
-    lines += ["", _BREAKS, *_head("p", "derivatives", "seeds", "1 / (p + 1)", *columns)]
-    lines += [_breaks(key, results) for key, results in groups.items()]
-    lines += ["", _RATIOS, *_head("p", "starts", *shown)]
-    lines += [
-        line for order in (1, 2) for starts in STARTS for line in _paired(rows, order, starts)
-    ]
-    return ("\n".join(lines) + "\n").encode()
+    gaps = table(
+        ["p", "derivatives", "starts", *shown, "seconds"],
+        (_gaps(*group, rows, starts) for starts in STARTS for group in groups.items()),
+    )
+    breaks = table(
+        ["p", "derivatives", "seeds", "1 / (p + 1)", *columns],
+        (_breaks(*group) for group in groups.items()),
+    )
+    paired = table(
+        ["p", "starts", *shown],
+        (cells for order in (1, 2) for starts in STARTS for cells in _paired(rows, order, starts)),
+    )
+    return f"{_GAPS}\n{gaps}\n{_BREAKS}\n{breaks}\n{_RATIOS}\n{paired}".encode()
 
 
-def _head(*names: str) -> list[str]:
-    return [f"| {' | '.join(names)} |", "|" + "---|" * len(names)]
-
-
-def _gaps(key: tuple[int, str], results: Results, rows: Sequence[Row], starts: str) -> str:
+def _gaps(key: tuple[int, str], results: Results, rows: Sequence[Row], starts: str) -> list[str]:
     order, source = key
     cells = [str(order), NAMES[source], starts]
     for nu in _SHOWN:
@@ -95,19 +95,20 @@ def _gaps(key: tuple[int, str], results: Results, rows: Sequence[Row], starts: s
         tail = float(np.median([gap["q90"][column] for gap in gaps]))
         cells.append(f"{_text([gap['median'][column] for gap in gaps])}, {tail:.2g}")
     ours = [row for row in rows if (row["cell"]["order"], row["cell"]["source"]) == key]
-    return f"| {' | '.join(cells)} | {np.median([row['seconds'] for row in ours]):.0f} |"
+    return [*cells, f"{np.median([row['seconds'] for row in ours]):.0f}"]
 
 
-def _breaks(key: tuple[int, str], results: Results) -> str:
+def _breaks(key: tuple[int, str], results: Results) -> list[str]:
     order, source = key
     cells = [str(order), NAMES[source], str(len(results)), list(THRESHOLDS.values())[order]]
     for starts in STARTS:
         for quantity in _QUANTITIES:
             cells.append(_text([breaks_at(result, starts, quantity) for result in results]))
-    return f"| {' | '.join(cells)} |"
+    return cells
 
 
-def _paired(rows: Sequence[Row], order: int, starts: str) -> list[str]:
+def _paired(rows: Sequence[Row], order: int, starts: str) -> list[list[str]]:
+    """Return the line of an order and its starts, or none where no seed has both sources."""
     ours, theirs = (
         {
             row["cell"]["seed"]: row["result"]
@@ -127,7 +128,7 @@ def _paired(rows: Sequence[Row], order: int, starts: str) -> list[str]:
             for group in (ours, theirs)
         ]
         cells.append(_text((np.array(gaps[0]) / gaps[1]).tolist()))
-    return [f"| {order} | {starts} | {' | '.join(cells)} |"]
+    return [[str(order), starts, *cells]]
 
 
 def _column(result: dict[str, Any], nu: float) -> int:

@@ -5,8 +5,8 @@ from typing import Any
 
 from benchmarks.comparison import differences_table, draw_scores, scores_of, scores_table
 from benchmarks.controllers import available
-from benchmarks.distillation import distillations
-from benchmarks.finite_difference import HORIZON, SEEDS, experts
+from benchmarks.distillation import distillations, usual_arguments
+from benchmarks.finite_difference import SEEDS, experts
 from benchmarks.runner import Cell, Row
 
 __all__ = ["MUJOCO"]
@@ -49,8 +49,7 @@ def cells(quick: bool) -> list[Cell]:
 
 def arguments(cell: Cell) -> dict[str, Any]:
     """Return the cell's trainer and source; the rest are defaults."""
-    settings = {"expert": cell["expert"], "episodes": cell["episodes"], "seed": cell["seed"]}
-    return {**settings, "horizon": HORIZON, **METHODS[cell["method"]]}
+    return usual_arguments(cell) | METHODS[cell["method"]]
 
 
 def draw(rows: Sequence[Row]) -> dict[str, bytes]:

@@ -265,6 +265,15 @@ def disturbed_row(cell):
     return {"cell": cell, "result": result}
 
 
+def test_what_figures_call_a_method():
+    from benchmarks.finite_difference import label
+
+    assert label("1") == "1 probe"
+    assert label("50") == "50 probes"
+    assert label("plain") == "plain cloning"
+    assert label("expert") == "expert"
+
+
 def test_a_student_beside_its_expert_under_disturbances():
     from benchmarks.robustness import ROBUSTNESS
 
