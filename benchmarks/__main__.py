@@ -23,6 +23,7 @@ from benchmarks.runner import (
 from benchmarks.speed import SPEED
 from benchmarks.stability import STABILITY
 from benchmarks.trainers import MUJOCO
+from benchmarks.training_length import TRAINING_LENGTH
 from fdtasil.storage import write_bytes
 
 BENCHMARKS: dict[str, Benchmark] = {
@@ -35,6 +36,7 @@ BENCHMARKS: dict[str, Benchmark] = {
         QUALITY,
         NON_DIFFERENTIABLE,
         STABILITY,
+        TRAINING_LENGTH,
         SPEED,
     )
 }

@@ -1,0 +1,58 @@
+"""How long to train: return against gradient steps, with little data and with much."""
+
+from collections.abc import Sequence
+from typing import Any
+
+from benchmarks.comparison import differences_table, draw_scores, scores_of, scores_table
+from benchmarks.distillation import distillations, usual_arguments
+from benchmarks.finite_difference import SEEDS, STANDARD_METHODS, experts, label
+from benchmarks.runner import Cell, Row
+
+__all__ = ["TRAINING_LENGTH"]
+
+BUDGETS = (5, 20)
+STEPS = (4_000, 8_000, 16_000)
+SOURCES = ("10", "plain")
+METHODS: dict[str, dict[str, Any]] = {
+    f"{label(source)}, {steps:,} steps": {**STANDARD_METHODS[source], "steps": steps}
+    for source in SOURCES
+    for steps in STEPS
+}
+# What longer training adds, with probes and without.
+PAIRS = tuple(
+    tuple(f"{label(source)}, {steps:,} steps" for steps in (longer, STEPS[0]))
+    for source in SOURCES
+    for longer in STEPS[1:]
+)
+
+
+def cells(quick: bool) -> list[Cell]:
+    """Every method, budget, seed and expert."""
+    return [
+        {"expert": expert, "episodes": budget, "method": method, "seed": seed}
+        for method in METHODS
+        for budget in (BUDGETS[:1] if quick else BUDGETS)
+        for seed in (range(2) if quick else SEEDS)
+        for expert in (experts()[:1] if quick else experts())
+    ]
+
+
+def arguments(cell: Cell) -> dict[str, Any]:
+    """Return the cell's method; the rest are defaults."""
+    return usual_arguments(cell) | METHODS[cell["method"]]
+
+
+def draw(rows: Sequence[Row]) -> dict[str, bytes]:
+    """One picture and two tables, of the budgets that are complete."""
+    scores = scores_of(rows, list(METHODS), len(SEEDS))
+    if not scores:
+        return {}
+    differences = differences_table(scores, PAIRS)
+    text = f"{scores_table(scores, list(METHODS))}\nDifferences on equal seeds:\n\n{differences}"
+    return {
+        "training_length.png": draw_scores(scores, list(METHODS), lambda method: method),
+        "training_length.md": text.encode(),
+    }
+
+
+TRAINING_LENGTH = distillations("training_length", __doc__ or "", cells, arguments, draw)
