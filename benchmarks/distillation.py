@@ -7,9 +7,10 @@ import fdtasil
 from benchmarks.controllers import CONTROLLERS
 from benchmarks.runner import Benchmark, Cell, Row
 
-__all__ = ["HORIZON", "distillations", "usual_arguments"]
+__all__ = ["HORIZON", "STEPS", "distillations", "usual_arguments"]
 
 HORIZON = 300
+STEPS = 4_000  # the defaults' for little data, so that no method is trained longer than another
 
 
 def distillations(
@@ -37,8 +38,9 @@ def distillations(
 
 
 def usual_arguments(cell: Cell) -> dict[str, Any]:
-    """Return the arguments that a cell gives by its names: expert, trajectories and seed."""
-    return {name: cell[name] for name in ("expert", "episodes", "seed")} | {"horizon": HORIZON}
+    """Return a cell's expert, trajectories and seed, at a horizon and steps that all share."""
+    given = {name: cell[name] for name in ("expert", "episodes", "seed")}
+    return given | {"horizon": HORIZON, "steps": STEPS}
 
 
 def _distil(expert: str, **arguments: Any) -> dict[str, Any]:

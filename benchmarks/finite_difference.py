@@ -18,7 +18,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     "standard": {},
     # The paper's sphere, radius, weight and optimiser, at the training cost of the other preset:
     # 4,500 epochs with every probe in every step would take weeks on two cores.
-    "paper": {"preset": "paper", "steps": 4000},
+    "paper": {"preset": "paper"},
 }
 # Presets and numbers of trajectories, the most telling first: what a cut sweep has is complete.
 GRID = (

@@ -4,25 +4,25 @@ from collections.abc import Sequence
 from typing import Any
 
 from benchmarks.comparison import differences_table, draw_scores, scores_of, scores_table
-from benchmarks.distillation import distillations, usual_arguments
+from benchmarks.distillation import STEPS, distillations, usual_arguments
 from benchmarks.finite_difference import SEEDS, STANDARD_METHODS, experts, label
 from benchmarks.runner import Cell, Row
 
 __all__ = ["TRAINING_LENGTH"]
 
 BUDGETS = (5, 20)
-STEPS = (4_000, 8_000, 16_000)
+LENGTHS = (STEPS, 2 * STEPS, 4 * STEPS)
 SOURCES = ("10", "plain")
 METHODS: dict[str, dict[str, Any]] = {
     f"{label(source)}, {steps:,} steps": {**STANDARD_METHODS[source], "steps": steps}
     for source in SOURCES
-    for steps in STEPS
+    for steps in LENGTHS
 }
 # What longer training adds, with probes and without.
 PAIRS = tuple(
-    tuple(f"{label(source)}, {steps:,} steps" for steps in (longer, STEPS[0]))
+    tuple(f"{label(source)}, {steps:,} steps" for steps in (longer, STEPS))
     for source in SOURCES
-    for longer in STEPS[1:]
+    for longer in LENGTHS[1:]
 )
 
 

@@ -29,6 +29,8 @@ class Fit:
 
     Attributes:
         steps: Gradient steps, or None to count epochs.
+        steps_for: States that `steps` are meant for: more states take more steps, by the square
+            root of their number. None takes `steps` whatever their number.
         epochs: Visits of each state, or None to count steps; one of the two is set.
         batch_size: States in a minibatch; fewer where there are fewer states.
         learning_rate: Peak rate of AdamW, with cosine decay to zero.
@@ -45,6 +47,7 @@ class Fit:
     """
 
     steps: int | None
+    steps_for: int | None
     epochs: int | None
     batch_size: int
     learning_rate: float
@@ -60,7 +63,7 @@ class Fit:
         if (self.steps is None) == (self.epochs is None):
             found = f"steps={self.steps}, epochs={self.epochs}"
             raise SettingError(found, "one of the two", "leave one out")
-        for name in ("steps", "epochs", "batch_size", "patience"):
+        for name in ("steps", "steps_for", "epochs", "batch_size", "patience"):
             value = getattr(self, name)
             whole = isinstance(value, int) and not isinstance(value, bool) and value > 0
             if value is not None and not whole:
@@ -88,9 +91,11 @@ class Fit:
 
     def total_steps(self, states: int) -> int:
         """Return the gradient steps of a training on `states` states."""
-        if self.steps is not None:
+        if self.steps is None:
+            return (self.epochs or 0) * self.steps_an_epoch(states)
+        if self.steps_for is None or states <= self.steps_for:
             return self.steps
-        return (self.epochs or 0) * self.steps_an_epoch(states)
+        return round(self.steps * (states / self.steps_for) ** 0.5)
 
     def held_out(self, episodes: int) -> int:
         """Return how many of `episodes` episodes are held out."""

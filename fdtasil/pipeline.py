@@ -112,7 +112,8 @@ def distill(
             (B, n) -> (B, k); the expert sees all. Probes move only what the student sees.
         hidden: Widths of the student's hidden layers, or that of the only one.
         activation: One of elu, gelu, relu, silu, tanh.
-        steps: Gradient steps of a round; leave out where `epochs` is given.
+        steps: Gradient steps of a round; leave out where `epochs` is given. Usually 4,000, and
+            beyond 1,500 states more, by the square root of their number.
         epochs: Visits of each state in a round; leave out where `steps` is given.
         batch_size: States in a minibatch.
         learning_rate: Peak learning rate of AdamW, with cosine decay to zero.

@@ -55,9 +55,10 @@ class Preset:
     def fit_with(self, **given: float | None) -> Fit:
         """Return the optimisation with the fields of `Fit` that are given (not None) put in."""
         changes: dict[str, Any] = {k: value for k, value in given.items() if value is not None}
-        # Steps and epochs are two ways to say one thing: saying one unsays the other.
+        # Steps and epochs are two ways to say one thing: saying one unsays the other, and what is
+        # said holds for any number of states.
         if "steps" in changes or "epochs" in changes:
-            changes = {"steps": None, "epochs": None, **changes}
+            changes = {"steps": None, "steps_for": None, "epochs": None, **changes}
         return replace(self.fit, **changes)
 
 
@@ -71,6 +72,7 @@ PRESETS = {
         activation="gelu",
         fit=Fit(
             steps=4000,
+            steps_for=1500,
             epochs=None,
             batch_size=100,
             learning_rate=1e-3,
@@ -94,6 +96,7 @@ PRESETS = {
         activation="gelu",
         fit=Fit(
             steps=None,
+            steps_for=None,
             epochs=4500,
             batch_size=100,
             learning_rate=1e-3,

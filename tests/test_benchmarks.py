@@ -214,14 +214,13 @@ def test_distillations_are_sent_to_other_processes(tmp_path):
 
 def test_the_same_distillation_is_found_in_several_benchmarks():
     from benchmarks.finite_difference import FINITE_DIFFERENCE
-    from benchmarks.quality import QUALITY
     from benchmarks.queries import QUERIES
     from benchmarks.trainers import MUJOCO
 
     def known(benchmark):
         return {json.dumps(benchmark.arguments(c), sort_keys=True) for c in benchmark.cells(False)}
 
-    for benchmark in (QUALITY, QUERIES, MUJOCO):
+    for benchmark in (QUERIES, MUJOCO):
         assert known(benchmark) & known(FINITE_DIFFERENCE)
 
 

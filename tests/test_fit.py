@@ -198,6 +198,12 @@ def test_steps_and_epochs_are_two_ways_to_say_one_thing():
         STANDARD.fit_with(steps=1, epochs=1)
 
 
+def test_much_data_is_trained_on_for_longer_unless_steps_are_given():
+    usual = STANDARD.fit.steps
+    assert [STANDARD.fit.total_steps(n) for n in (1, 1500, 6000)] == [usual, usual, 2 * usual]
+    assert STANDARD.fit_with(steps=7).total_steps(6000) == 7
+
+
 @pytest.mark.parametrize(
     "wrong", [{"steps": 0}, {"batch_size": 2.5}, {"weight": -1.0}, {"learning_rate": float("nan")}]
 )
