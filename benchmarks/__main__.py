@@ -16,6 +16,7 @@ from benchmarks.runner import (
     RESULTS,
     Benchmark,
     known_results,
+    provenance,
     read_rows,
     results_of,
     run,
@@ -101,6 +102,8 @@ def _draw(benchmark: Benchmark, results: Path, out: Path) -> int:
         print(f"no part of {benchmark.name} is complete yet: run it on", file=sys.stderr)
         return 1
     for name, data in files.items():
+        if name.endswith(".md"):
+            data += f"\n{provenance(rows)}\n".encode()
         write_bytes(out / name, data)
         print(out / name)
     return 0

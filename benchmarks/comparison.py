@@ -7,7 +7,16 @@ from benchmarks.runner import Row
 from benchmarks.statistics import difference_text, interval_text, paired_difference
 from benchmarks.tables import table
 
-__all__ = ["Column", "Scores", "differences_table", "draw_scores", "scores_of", "scores_table"]
+__all__ = [
+    "Column",
+    "Scores",
+    "differences_table",
+    "draw_methods",
+    "draw_scores",
+    "scores_of",
+    "scores_table",
+    "scores_text",
+]
 
 Column = int | str
 """Where a score stands across a figure: a number of trajectories, or the name of a condition."""
@@ -60,6 +69,25 @@ def differences_table(
         found = [paired_difference(group[ours], group[theirs]) for ours, theirs in pairs]
         rows.append([expert, str(column), *(difference_text(*difference) for difference in found)])
     return table(["expert", across, *(f"{ours} - {theirs}" for ours, theirs in pairs)], rows)
+
+
+def scores_text(scores: Scores, methods: Sequence[str], pairs: Sequence[tuple[str, str]]) -> str:
+    """Return the table of the methods, and that of the pairs' differences."""
+    differences = differences_table(scores, pairs)
+    return f"{scores_table(scores, methods)}\nDifferences on equal seeds:\n\n{differences}"
+
+
+def draw_methods(
+    name: str, scores: Scores, methods: Sequence[str], pairs: Sequence[tuple[str, str]]
+) -> dict[str, bytes]:
+    """Return picture and tables of methods that are called by their names; none without scores."""
+    if not scores:
+        return {}
+    picture = draw_scores(scores, methods, lambda method: method)
+    return {
+        f"{name}.png": picture,
+        f"{name}.md": scores_text(scores, methods, pairs).encode(),
+    }
 
 
 def draw_scores(

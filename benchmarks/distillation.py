@@ -10,7 +10,7 @@ from benchmarks.runner import Benchmark, Cell, Row
 __all__ = ["HORIZON", "STEPS", "distillations", "usual_arguments"]
 
 HORIZON = 300
-STEPS = 4_000  # the defaults' for little data, so that no method is trained longer than another
+STEPS = 4_000  # of all, however much data they have: none is trained longer than another
 
 
 def distillations(

@@ -50,7 +50,7 @@ def run(cell: Cell) -> dict[str, Any]:
     evaluation, report = result.evaluation, result.report
     assert evaluation is not None
     scores = ("normalized_return", "expert_return", "student_return", "survival", "action_error")
-    names = ("train_seconds", "queries", "probes", "radius", "warnings")
+    names = ("train_seconds", "steps", "queries", "probes", "radius", "warnings")
     return {
         **{name: getattr(evaluation, name) for name in scores},
         **{name: report[name] for name in names if name in report},

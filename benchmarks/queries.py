@@ -25,7 +25,7 @@ BUDGETS: dict[str, tuple[int, ...]] = {
 }
 METHODS: dict[str, dict[str, Any]] = {
     **STANDARD_METHODS,
-    # Many states are each seen seldom in the usual 4,000 steps: is that what holds cloning back?
+    # Many states are each seen seldom in as many steps: is that what holds cloning back?
     "plain, longer": {"probes": 0, "steps": 12_000},
     "dagger": {"trainer": "dagger", "probes": 0},
 }
@@ -55,7 +55,7 @@ def cells(quick: bool) -> list[Cell]:
 
 
 def arguments(cell: Cell) -> dict[str, Any]:
-    """Return the cell's method; the rest are defaults."""
+    """Return the cell's method, with `usual_arguments`."""
     return usual_arguments(cell) | METHODS[cell["method"]]
 
 

@@ -71,7 +71,7 @@ def compare_under_disturbances(
         episodes=EPISODES,
         horizon=HORIZON,
         seed=seed,
-        evaluation_episodes=1,  # judged below
+        evaluation_episodes=0,  # judged below
         progress=False,
         **settings,
     )

@@ -23,6 +23,7 @@ __all__ = [
     "Cell",
     "Row",
     "known_results",
+    "provenance",
     "read_rows",
     "results_of",
     "run",
@@ -148,6 +149,16 @@ def read_rows(path: Path) -> list[Row]:
 def results_of(rows: Iterable[Row]) -> list[Row]:
     """Return the newest row with a result of each cell."""
     return list({_key(row["cell"]): row for row in rows if "result" in row}.values())
+
+
+def provenance(rows: Iterable[Row]) -> str:
+    """Return, in a sentence, on which machines and at which commits rows were made."""
+    made = sorted({(row["machine"], row["commit"]) for row in rows})
+    parts = (
+        f"{machine} ({', '.join(commit for other, commit in made if other == machine)})"
+        for machine in dict.fromkeys(machine for machine, _ in made)
+    )
+    return f"Made on {'; '.join(parts)}."
 
 
 def _reused(

@@ -83,7 +83,7 @@ def _task(n: int, m: int, spec: str | None) -> Callable[[], object]:
     preset = replace(PRESETS["standard"], calibrated=False)
     probes = preset.complete(Probes.parse(spec))
     probes = probes.with_order(1) if probes else None
-    scales, settings = scales_of(observations), replace(preset.fit, steps=STEPS)
+    scales, settings = scales_of(observations), preset.fit_with(steps=STEPS)
     ones = np.ones(m, np.float32)
 
     def run() -> None:

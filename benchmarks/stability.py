@@ -82,7 +82,7 @@ def run(cell: Cell) -> dict[str, Any]:
         hidden=(64, 64, 64),
         steps=cell["steps"],
         seed=seed,
-        evaluation_episodes=1,  # judged below
+        evaluation_episodes=0,  # judged below
         progress=False,
     )
     seen = result.demonstrations

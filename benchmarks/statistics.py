@@ -28,13 +28,17 @@ def interval(
 ) -> tuple[float, float]:
     """Return the 95 % bootstrap interval of a statistic over seeds.
 
+    It is a little narrow: of five normal seeds' interquartile mean it covers 90 %.
+
     A single value, or equal ones, give an interval of no width: they say nothing of the spread.
 
     Args:
         values: One for each seed.
         statistic: Takes an array and `axis`; the interquartile mean if none is given.
     """
-    sample = np.asarray(values, float)
+    sample = np.asarray(values, float)  # None becomes NaN
+    if not np.isfinite(sample).all():
+        raise ValueError(f"{sample}: a mean of what is no number says nothing")
     if len(sample) < 2 or np.ptp(sample) == 0:
         return float(sample[0]), float(sample[0])
     found = stats.bootstrap(

@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
-from benchmarks.comparison import differences_table, draw_scores, scores_of, scores_table
+from benchmarks.comparison import draw_methods, scores_of
 from benchmarks.controllers import available
 from benchmarks.distillation import distillations, usual_arguments
 from benchmarks.finite_difference import SEEDS, experts
@@ -48,21 +48,13 @@ def cells(quick: bool) -> list[Cell]:
 
 
 def arguments(cell: Cell) -> dict[str, Any]:
-    """Return the cell's trainer and source; the rest are defaults."""
+    """Return the cell's trainer and source, with `usual_arguments`."""
     return usual_arguments(cell) | METHODS[cell["method"]]
 
 
 def draw(rows: Sequence[Row]) -> dict[str, bytes]:
     """One picture and two tables, of the budgets that are complete."""
-    scores = scores_of(rows, list(METHODS), len(SEEDS))
-    if not scores:
-        return {}
-    differences = differences_table(scores, PAIRS)
-    text = f"{scores_table(scores, list(METHODS))}\nDifferences on equal seeds:\n\n{differences}"
-    return {
-        "mujoco.png": draw_scores(scores, list(METHODS), lambda method: method),
-        "mujoco.md": text.encode(),
-    }
+    return draw_methods("mujoco", scores_of(rows, list(METHODS), len(SEEDS)), list(METHODS), PAIRS)
 
 
 MUJOCO = distillations("mujoco", __doc__ or "", cells, arguments, draw)

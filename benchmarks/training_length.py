@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
-from benchmarks.comparison import differences_table, draw_scores, scores_of, scores_table
+from benchmarks.comparison import draw_methods, scores_of
 from benchmarks.distillation import STEPS, distillations, usual_arguments
 from benchmarks.finite_difference import SEEDS, STANDARD_METHODS, experts, label
 from benchmarks.runner import Cell, Row
@@ -38,21 +38,14 @@ def cells(quick: bool) -> list[Cell]:
 
 
 def arguments(cell: Cell) -> dict[str, Any]:
-    """Return the cell's method; the rest are defaults."""
+    """Return the cell's method, with `usual_arguments` but for the steps."""
     return usual_arguments(cell) | METHODS[cell["method"]]
 
 
 def draw(rows: Sequence[Row]) -> dict[str, bytes]:
     """One picture and two tables, of the budgets that are complete."""
     scores = scores_of(rows, list(METHODS), len(SEEDS))
-    if not scores:
-        return {}
-    differences = differences_table(scores, PAIRS)
-    text = f"{scores_table(scores, list(METHODS))}\nDifferences on equal seeds:\n\n{differences}"
-    return {
-        "training_length.png": draw_scores(scores, list(METHODS), lambda method: method),
-        "training_length.md": text.encode(),
-    }
+    return draw_methods("training_length", scores, list(METHODS), PAIRS)
 
 
 TRAINING_LENGTH = distillations("training_length", __doc__ or "", cells, arguments, draw)

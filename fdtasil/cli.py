@@ -12,6 +12,7 @@ from fdtasil.distilled import Distilled
 from fdtasil.errors import FdtasilError, SettingError
 from fdtasil.evaluation import interval_text, score_text
 from fdtasil.inspection import inspect_expert
+from fdtasil.lock import locked
 from fdtasil.pipeline import distill, evaluate
 from fdtasil.sb3 import export_sb3
 from fdtasil.shell import (
@@ -36,7 +37,10 @@ def _distill(compare: bool, **arguments: Any) -> None:
         arguments = {**_remembered(resume), "resume": resume}
     elif resume is None and not (arguments["out"] / "checkpoints").exists():
         plain = {k: str(v) if isinstance(v, Path) else v for k, v in arguments.items()}
-        write_bytes(arguments["out"] / COMMAND, to_json(plain))
+        with locked(arguments["out"]):  # another run's arguments stay its own
+            write_bytes(arguments["out"] / COMMAND, to_json(plain))
+    if resume is not None:
+        arguments["out"] = None  # a resumed run stays in its own folder
     result, out = distill(**arguments), resume or arguments["out"]
     plainly = {**arguments, "probes": 0, "out": None, "resume": None, "log_formats": ()}
     print(_side_by_side(result, distill(**plainly) if compare else None))

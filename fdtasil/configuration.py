@@ -37,11 +37,11 @@ class Configuration:
         hidden: Widths of the student's hidden layers.
         activation: Of the student.
         fit: The optimisation.
-        episodes: Number of demonstrations.
+        episodes: Number of demonstrations, recorded or given.
         horizon: T, steps after which an episode is cut; 0 without an environment.
         seed: The one seed.
         device: Where the student is trained.
-        evaluation_episodes: Paired episodes of the evaluation; 0 where nothing can be compared.
+        evaluation_episodes: Paired episodes of the evaluation; 0 where nothing is compared.
         max_queries: The most that the expert may be asked, or None.
     """
 
@@ -71,12 +71,15 @@ class Configuration:
     def predicted_queries(self) -> dict[str, int]:
         """Return the rows that the run will ask the expert for, by purpose.
 
-        Exact where no episode ends early and every coordinate moves; an upper bound elsewhere.
+        Exact where no episode ends early and every coordinate moves; an upper bound elsewhere,
+        but for a source that resamples: fewer states are visited more often, each time with new
+        questions, which only `max_queries` bounds.
         """
         purposes = ("check", "act", "label", "calibrate", "probe", "evaluate")
         found: dict[str, int] = dict.fromkeys(purposes, 0)
-        if self.evaluation_episodes:
-            found["check"] = 2 * GATE_STATES * _ROWS_A_STATE
+        if self.expert is not None and self.horizon:
+            gates = 2 if self.evaluation_episodes else 1
+            found["check"] = gates * GATE_STATES * _ROWS_A_STATE
             found["evaluate"] = 2 * self.evaluation_episodes * self.horizon
         if self.trainer is not None:
             found |= self.trainer.queries(self.episodes, self.horizon)
@@ -126,24 +129,26 @@ class Configuration:
         New states are asked about once; a source that resamples asks about all states again, for
         every pool but the first of every round.
         """
-        counts = self.trainer.rounds(self.episodes) if self.trainer else [0]
+        counts = self.trainer.rounds(self.episodes) if self.trainer else [self.episodes]
+        length = self.horizon if self.states is None else self.states / self.episodes
         collected, episodes, total = 0, 0, 0
         for count in counts:
-            new = count * self.horizon if self.states is None else self.states
+            new = round(count * length)
             collected, episodes = collected + new, episodes + count
-            held = self.fit.held_out(episodes) * self.horizon
+            held = round(self.fit.held_out(episodes) * length)
             once = probes.queries(1, self.observation_size, visits=1)
             pools = probes.pools(self.observation_size, self.fit.visits(collected - held))
             total += once * new + once * collected * (pools - 1)
         return total
 
 
-def check_count(name: str, value: int) -> int:
+def check_count(name: str, value: int, least: int = 1) -> int:
     """Return `value`.
 
     Raises:
-        SettingError: If it is not a positive integer.
+        SettingError: If it is not an integer of at least `least`.
     """
-    if isinstance(value, bool) or not isinstance(value, Integral) or value < 1:
-        raise SettingError(f"{name}={value!r}", "a positive integer", f"write {name}=5")
+    if isinstance(value, bool) or not isinstance(value, Integral) or value < least:
+        expected = "a positive integer" if least else "an integer of at least 0"
+        raise SettingError(f"{name}={value!r}", expected, f"write {name}=5")
     return int(value)

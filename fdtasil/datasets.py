@@ -45,6 +45,11 @@ class Dataset:
         states = self.demonstrations
         return states.observations.shape[1], states.actions.shape[1]
 
+    @property
+    def episodes(self) -> int:
+        """How many episodes there are."""
+        return len(np.unique(self.demonstrations.episode))
+
     def to_bytes(self) -> bytes:
         """Return the dataset as an npz file.
 

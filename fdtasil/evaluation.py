@@ -126,10 +126,10 @@ def compare(
     ours, theirs = student_episodes.returns, expert_episodes.returns
     meaningful = float(theirs.mean()) > reference
     if not meaningful:
+        least = "0" if np.median(theirs) > 0 else f"{reference:.4g}, that of random actions"
         warnings.warn(
-            f"the expert's return {theirs.mean():.4g} is not above {reference:.4g}, that of "
-            "random actions: no normalised return; check that expert and environment belong "
-            "together",
+            f"the expert's return {theirs.mean():.4g} is not above {least}: no normalised return; "
+            "check that expert and environment belong together",
             FdtasilWarning,
             stacklevel=2,
         )

@@ -12,7 +12,7 @@ from fdtasil.progress import Stages
 from fdtasil.recording import Episodes
 from fdtasil.rollouts import first_observations, rollout
 
-__all__ = ["examine"]
+__all__ = ["check_first", "examine"]
 
 _LONG = 600.0  # seconds of questions that are announced
 
@@ -47,14 +47,25 @@ def examine(
         ExpertError: If it fails a check.
         EnvironmentFault: If nothing can be learnt from its episodes.
     """
-    first = first_observations(pool, [starts[e % len(starts)] for e in range(GATE_STATES)])
-    _announce(check_expert(expert, first, pool.boxes, force=force), rows)
+    check_first(expert, pool, starts, force=force, rows=rows)
     with stages.stage("expert", len(starts) * horizon, "step") as move:
         behaviour = follow(expert.policy("evaluate"))
         episodes = rollout(behaviour, pool, starts, horizon, on_step=move)
     check_episodes(episodes, pool.name)
     check_expert(expert, episodes.spread(GATE_STATES), pool.boxes, force=force)
     return episodes
+
+
+def check_first(
+    expert: Expert, pool: EnvironmentPool, starts: list[int], *, force: bool, rows: int
+) -> None:
+    """Check an expert on first states, before it acts; the arguments of `examine`.
+
+    Raises:
+        ExpertError: If it fails a check.
+    """
+    first = first_observations(pool, [starts[e % len(starts)] for e in range(GATE_STATES)])
+    _announce(check_expert(expert, first, pool.boxes, force=force), rows)
 
 
 def _announce(seconds: float, rows: int) -> None:
@@ -65,5 +76,5 @@ def _announce(seconds: float, rows: int) -> None:
             f"may ask take up to {seconds * rows / 3600:.1f} h: lower probes, episodes, horizon "
             "or evaluation_episodes, or let load_expert(..., workers=) answer side by side",
             FdtasilWarning,
-            stacklevel=5,
+            stacklevel=6,
         )

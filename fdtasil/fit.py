@@ -1,7 +1,7 @@
 """Minibatch optimisation of a student; knows no environment and no expert."""
 
 import math
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import count, islice
 
@@ -18,7 +18,7 @@ from fdtasil.loss import Minibatch, Weights, taylor_loss
 from fdtasil.probes import Probes
 from fdtasil.student import Student
 
-__all__ = ["Fit", "Hooks", "fit"]
+__all__ = ["Fit", "Hooks", "fit", "hold_out"]
 
 _LOG_EVERY = 100  # steps between two entries of the history; reading a loss waits for the device
 
@@ -30,9 +30,9 @@ class Fit:
     Attributes:
         steps: Gradient steps, or None to count epochs.
         steps_for: States that `steps` are meant for: more states take more steps, by the square
-            root of their number. None takes `steps` whatever their number.
+            root of their number, in whole hundreds. None takes `steps` whatever their number.
         epochs: Visits of each state, or None to count steps; one of the two is set.
-        batch_size: States in a minibatch; fewer where there are fewer states.
+        batch_size: States in a minibatch at most; an epoch's are of almost equal size.
         learning_rate: Peak rate of AdamW, with cosine decay to zero.
         weight_decay: Decoupled weight decay.
         epsilon: AdamW's epsilon.
@@ -63,6 +63,9 @@ class Fit:
         if (self.steps is None) == (self.epochs is None):
             found = f"steps={self.steps}, epochs={self.epochs}"
             raise SettingError(found, "one of the two", "leave one out")
+        if self.steps is None and self.steps_for is not None:
+            found = f"steps_for={self.steps_for} without steps"
+            raise SettingError(found, "steps that grow", "leave it out, or give steps")
         for name in ("steps", "steps_for", "epochs", "batch_size", "patience"):
             value = getattr(self, name)
             whole = isinstance(value, int) and not isinstance(value, bool) and value > 0
@@ -95,7 +98,8 @@ class Fit:
             return (self.epochs or 0) * self.steps_an_epoch(states)
         if self.steps_for is None or states <= self.steps_for:
             return self.steps
-        return round(self.steps * (states / self.steps_for) ** 0.5)
+        grown = self.steps * (states / self.steps_for) ** 0.5
+        return _LOG_EVERY * round(grown / _LOG_EVERY)  # a last entry of a few steps tells little
 
     def held_out(self, episodes: int) -> int:
         """Return how many of `episodes` episodes are held out."""
@@ -162,7 +166,7 @@ def fit(
     told = hooks or Hooks()
     device = student.mean.device
     batches = Batches(demonstrations, probes, answers, random, device)
-    training, held_out = _split(demonstrations, settings, random("held out"))
+    training, held_out = hold_out(demonstrations, settings, random("held out"))
     per_epoch = settings.steps_an_epoch(len(training))
     steps = settings.total_steps(len(training))
     optimiser = torch.optim.AdamW(
@@ -175,7 +179,7 @@ def fit(
     weights = Weights(settings.weight, settings.curvature_weight if order == 2 else None)
     stencil = probes.stencil if probes else None
     # Taken once, of the first pool: two validations then differ by the student alone.
-    judge = batches.visit(held_out, 0) if len(held_out) else None
+    judges = [batches.visit(part, 0) for part in held_out.split(settings.batch_size) if len(part)]
     state = FitState(student, optimiser)
     if resume is not None:
         state.restore(resume)
@@ -199,7 +203,7 @@ def fit(
         optimiser.step()
         state.count(losses.detach())
         if state.step % _LOG_EVERY == 0 or state.step == steps:
-            held = None if judge is None else float(loss_of(judge)[0].detach())
+            held = _held_out_loss(loss_of, judges)
             told.entry(state.log(held))
             if settings.patience is not None and state.stale >= settings.patience:
                 break
@@ -213,7 +217,18 @@ def _deal(batches: Batches, rows: Tensor, per_epoch: int, first_epoch: int) -> I
         yield from batches.epoch(number, rows, per_epoch)
 
 
-def _split(
+def _held_out_loss(
+    loss_of: Callable[[Minibatch], Tensor], judges: Sequence[Minibatch]
+) -> float | None:
+    """Return the mean loss of all held-out rows, or None where there are none."""
+    if not judges:
+        return None
+    rows = [len(batch.actions) for batch in judges]
+    losses = [float(loss_of(batch)[0].detach()) for batch in judges]
+    return sum(n * loss for n, loss in zip(rows, losses, strict=True)) / sum(rows)
+
+
+def hold_out(
     demonstrations: Demonstrations, settings: Fit, random: torch.Generator
 ) -> tuple[Tensor, Tensor]:
     """Return the rows to train on and those of held-out episodes."""

@@ -3,20 +3,22 @@
 import time
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from fdtasil.compute import pick_device, torch_settings
-from fdtasil.configuration import Configuration, check_count
+from fdtasil.configuration import GATE_STATES, Configuration, check_count
 from fdtasil.datasets import DatasetLike, load_dataset
 from fdtasil.distilled import Distilled
 from fdtasil.environments import EnvironmentLike, EnvironmentPool, resolve_horizon
+from fdtasil.errors import SettingError
 from fdtasil.evaluation import Evaluation, compare
 from fdtasil.events import Callback, Event, tell_all
-from fdtasil.examination import examine
+from fdtasil.examination import check_first, examine
 from fdtasil.experts import ExpertLike, load_expert
 from fdtasil.interrupts import heard_interrupts
 from fdtasil.presets import preset_of
-from fdtasil.probes import Probes
+from fdtasil.probes import USUAL_COUNT, Probes
 from fdtasil.progress import Stages
 from fdtasil.report import noted_warnings, report_of, versions
 from fdtasil.rounds import Rounds
@@ -33,13 +35,11 @@ from fdtasil.views import StudentObservation, View, columns_of, describe_view
 
 __all__ = ["distill", "evaluate"]
 
-DEFAULT_PROBES = 10
-
 
 def distill(
     expert: ExpertLike | None = None,
     env: EnvironmentLike | None = None,
-    probes: int | str | Probes = DEFAULT_PROBES,
+    probes: int | str | Probes = USUAL_COUNT,
     *,
     trainer: str | Trainer = "bc",
     episodes: int = 20,
@@ -96,7 +96,7 @@ def distill(
             asking at a ladder of radii first.
         trainer: Who acts in which round: "bc" (the expert), "dagger" (a mixture of expert and
             student), "dart" (the expert with noise), or a trainer with settings of its own.
-        episodes: Number of demonstrations.
+        episodes: Number of demonstrations; those given say it themselves.
         horizon: Steps after which an episode is cut; default: the environment's time limit.
         seed: Equal seeds give equal bytes, on one machine with the same versions.
         device: Where the student is trained: "cpu", "cuda".
@@ -124,7 +124,7 @@ def distill(
         max_gradient_norm: Scale longer gradients to this norm.
         validation: Share of the episodes held out, by which the best weights are chosen.
         patience: Validations (one each 100 steps) without a better one after which to stop.
-        evaluation_episodes: Episodes of the paired evaluation.
+        evaluation_episodes: Episodes of the paired evaluation; 0 leaves it out.
         max_queries: Refuse to start a run that may ask the expert more often.
         force: Go on with a warning where the expert fails the gate but answers.
         out: Folder of the run: checkpoints while it goes on, then all its files.
@@ -170,13 +170,17 @@ def distill(
         patience=patience,
     )
     stored = given is not None and given.answers is not None
-    source = source_of(probes, defaults, order, given, usual=DEFAULT_PROBES)
+    source = source_of(probes, defaults, order, given, usual=USUAL_COUNT)
     if source is not None and callable(student_obs):
         source = source.with_order(order)  # a curved view allows the forward stencil only
     place = pick_device(device)
-    widths = (hidden,) if isinstance(hidden, int) else hidden
+    widths = (hidden,) if isinstance(hidden, (int, np.integer)) else hidden
     check_seed(seed)
+    evaluated = check_count("evaluation_episodes", evaluation_episodes, least=0)
     check_shape(widths or (), activation or defaults.activation)
+    if out is not None and resume is not None:
+        found = f"out={str(out)!r} beside resume={str(resume)!r}"
+        raise SettingError(found, "one folder", "leave out= out: a resumed run stays in its own")
     with (
         noted_warnings() as notes,
         open_subject(expert, env, given, output=output, trust=trust) as subject,
@@ -198,16 +202,14 @@ def distill(
             order=order if source else 0,
             observation_size=subject.observation_size,
             student_obs=describe_view(student_obs),
-            hidden=defaults.hidden if widths is None else tuple(widths),
+            hidden=defaults.hidden if widths is None else tuple(map(int, widths)),
             activation=defaults.activation if activation is None else activation,
             fit=settings,
-            episodes=check_count("episodes", episodes),
+            episodes=given.episodes if given else check_count("episodes", episodes),
             horizon=resolve_horizon(horizon, subject.pool) if subject.pool else 0,
             seed=int(seed),
             device=device,
-            evaluation_episodes=check_count("evaluation_episodes", evaluation_episodes)
-            if subject.comparable
-            else 0,
+            evaluation_episodes=evaluated if subject.comparable else 0,
             max_queries=max_queries,
         )
         run.check_budget()
@@ -220,10 +222,10 @@ def distill(
         ):
             if folder and kept.finished and resume is not None:
                 return Distilled.load(folder, student_obs)
-            state = RunState(run, subject.expert, student_obs, kept, dataset=given)
+            state = RunState(run, subject.expert, student_obs, kept, dataset=given, notes=notes)
             callbacks = tell_all(callback, log_formats, folder)
             training = Training(state, place, Stages(progress), interrupts, callbacks)
-            result = _go(training, subject, notes, force=force)
+            result = _go(training, subject, force=force)
             if folder:
                 result.save(folder)
                 kept.close()
@@ -290,19 +292,24 @@ def evaluate(
         return compare(answer, black_box, theirs, pool, length, seed, stages)
 
 
-def _go(training: Training, subject: Subject, notes: list[str], *, force: bool) -> Distilled:
+def _go(training: Training, subject: Subject, *, force: bool) -> Distilled:
     """Gate, rounds, comparison, report."""
     state, run = training.state, training.state.run
     stages, expert, pool = training.stages, subject.expert, subject.pool
     with torch_settings(training.device) as precision:
         theirs = None
         if expert is not None and pool is not None:
-            starts = episode_seeds(run.seed, "evaluation", 0, run.evaluation_episodes)
+            starts = episode_seeds(
+                run.seed, "evaluation", 0, run.evaluation_episodes or GATE_STATES
+            )
             rows = sum(run.predicted_queries().values())
-            theirs = examine(expert, pool, starts, run.horizon, stages, force=force, rows=rows)
-        started = time.perf_counter()
+            if run.evaluation_episodes:
+                theirs = examine(expert, pool, starts, run.horizon, stages, force=force, rows=rows)
+            else:
+                check_first(expert, pool, starts, force=force, rows=rows)
+        state.started = time.perf_counter()
         Rounds(pool, training).all()
-        seconds, student, evaluation = time.perf_counter() - started, state.trained, None
+        seconds, student, evaluation = state.seconds, state.trained, None
         if expert is not None and pool is not None and theirs is not None:
             policy = state.view.policy(student.act)
             evaluation = compare(policy, expert, theirs, pool, run.horizon, run.seed, stages)
@@ -315,7 +322,6 @@ def _go(training: Training, subject: Subject, notes: list[str], *, force: bool) 
         state,
         train_seconds=seconds,
         matmul_precision=precision,
-        notes=notes,
     )
     settings = {**run.to_json(), "versions": report["versions"]}
     history, queries = state.history, report["queries"]

@@ -3,6 +3,8 @@
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
+import numpy as np
+
 from fdtasil.errors import SettingError
 from fdtasil.fit import Fit
 from fdtasil.probes import AdaptiveDirections, Probes, RandomSphere
@@ -54,7 +56,12 @@ class Preset:
 
     def fit_with(self, **given: float | None) -> Fit:
         """Return the optimisation with the fields of `Fit` that are given (not None) put in."""
-        changes: dict[str, Any] = {k: value for k, value in given.items() if value is not None}
+        changes: dict[str, Any] = {
+            # numpy's numbers are as good as Python's, but no JSON
+            name: value.item() if isinstance(value, np.generic) else value
+            for name, value in given.items()
+            if value is not None
+        }
         # Steps and epochs are two ways to say one thing: saying one unsays the other, and what is
         # said holds for any number of states.
         if "steps" in changes or "epochs" in changes:

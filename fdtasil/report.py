@@ -31,7 +31,6 @@ def report_of(
     *,
     train_seconds: float,
     matmul_precision: str,
-    notes: list[str],
 ) -> dict[str, Any]:
     """Return what `report.json` holds, as plain JSON values.
 
@@ -39,13 +38,16 @@ def report_of(
         configuration: The run's.
         evaluation: Student against expert, or None where they could not be compared.
         state: After the last round.
-        train_seconds: Wall-clock seconds of collecting, probing and training.
+        train_seconds: Wall-clock seconds of collecting, probing and training, those of the
+            interrupted run for what was taken up included.
         matmul_precision: torch's float32 matrix-product precision in force.
-        notes: Warnings on the way.
     """
     plain = configuration.to_json()
     source, calibration = state.source, state.calibration
-    predicted = replace(configuration, probes=source).predicted_queries()
+    # The ladder was chosen before it was known what it finds.
+    predicted = replace(configuration, probes=source).predicted_queries() | {
+        "calibrate": configuration.predicted_queries()["calibrate"]
+    }
     asked = state.expert.queries if state.expert else Counter[str]()
     return {
         "expert": {
@@ -70,7 +72,7 @@ def report_of(
         "steps": state.steps,
         "train_seconds": round(train_seconds, 2),
         "matmul_precision": matmul_precision,
-        "warnings": notes,
+        "warnings": state.notes,
     }
 
 

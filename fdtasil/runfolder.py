@@ -16,6 +16,7 @@ __all__ = ["RunFolder", "open_run_folder"]
 
 _CONFIG = "config.json"
 _CHECKPOINTS = "checkpoints"
+_FREE = "max_queries"  # what a run is allowed to ask changes none of its bytes
 
 
 @contextmanager
@@ -138,7 +139,7 @@ def _read_config(path: Path) -> dict[str, Any]:
 
 
 def _check_same(before: dict[str, Any], now: dict[str, Any], path: Path) -> None:
-    changed = _differences(before, now)
+    changed = _differences({**before, _FREE: None}, {**now, _FREE: None})
     versions = [change for change in changed if change.startswith("versions.")]
     settings = [change for change in changed if not change.startswith("versions.")]
     if settings:

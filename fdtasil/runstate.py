@@ -1,6 +1,7 @@
 """What grows from round to round of a run: how it is kept, and taken up again."""
 
 import json
+import time
 from collections import Counter
 from dataclasses import dataclass, field
 from typing import Any
@@ -43,6 +44,9 @@ class RunState:
         calibration: What was found about the expert in the first round, or None.
         source: The derivative source, with what the calibration found filled in; kept, for filling
             it in warns of a radius that misleads.
+        notes: The library's warnings so far; grows by itself.
+        earlier: Seconds that the interrupted run took for what is taken up from it.
+        started: When this process began, on the clock of `time.perf_counter`.
         again: Rows asked before a checkpoint was taken up, which the interrupted run has asked
             and counted too; None in a run that was not interrupted.
     """
@@ -57,6 +61,9 @@ class RunState:
     steps: int = 0
     episodes: int = 0
     counts: Counter[str] = field(default_factory=Counter)
+    notes: list[str] = field(default_factory=list)
+    earlier: float = 0.0
+    started: float = field(default_factory=time.perf_counter)
     again: int | None = None
     calibration: Calibration | None = None
     source: Probes | None = field(init=False)
@@ -134,13 +141,31 @@ class RunState:
 
     def _check_budget(self, rows: int) -> None:
         """Refuse to ask beyond the budget: early ends make a resampling source ask more often."""
-        asked, most = sum(self.ledger().values()), self.run.max_queries
+        # What a resumed run had to ask again is no part of what the run needs.
+        asked = sum(rows for purpose, rows in self.ledger().items() if purpose != "again")
+        most = self.run.max_queries
         if most is not None and asked + rows > most:
             raise SettingError(
                 f"{asked:,} rows are asked, and {rows:,} more are due",
                 f"at most max_queries={most:,}",
                 "raise max_queries, or leave out resample",
             )
+
+    @property
+    def seconds(self) -> float:
+        """Wall-clock seconds of collecting, probing and training so far."""
+        return self.earlier + time.perf_counter() - self.started
+
+    def so_far(self) -> dict[str, Any]:
+        """Return what every checkpoint keeps of the account: rows, warnings and seconds."""
+        return {"queries": self.ledger(), "notes": list(self.notes), "seconds": self.seconds}
+
+    def take_up(self, account: dict[str, Any]) -> None:
+        """Take up the account of the interrupted run."""
+        self.restore_ledger(account["queries"])
+        kept = account["notes"]
+        self.notes[:] = kept + [note for note in self.notes if note not in kept]
+        self.earlier, self.started = account["seconds"], time.perf_counter()
 
     def ledger(self) -> dict[str, int]:
         """Return the rows that the expert has answered so far, by purpose."""
@@ -161,8 +186,8 @@ class RunState:
         about = {
             "episodes": self.episodes,
             "counts": self.counts,
-            "queries": self.ledger(),
             "calibration": self.calibration.to_json() if self.calibration else None,
+            **self.so_far(),
         }
         self.folder.save(
             round_,
@@ -179,7 +204,7 @@ class RunState:
         state: dict[str, Any] = json.loads(files["state.json"])
         self.dataset = Dataset.from_bytes(files["demonstrations.npz"])
         self.episodes, self.counts = state["episodes"], Counter(state["counts"])
-        self.restore_ledger(state["queries"])
+        self.take_up(state)
         if state["calibration"] and self.calibration is None and self.run.probes is not None:
             self.calibration = Calibration.from_json(state["calibration"])
             self.source = self.calibration.complete(self.run.probes)
@@ -187,7 +212,7 @@ class RunState:
 
     def keep_trained(self, round_: int) -> None:
         """Keep a round's student."""
-        about = {"history": self.history, "steps": self.steps, "queries": self.ledger()}
+        about = {"history": self.history, "steps": self.steps, **self.so_far()}
         self.folder.save(
             round_,
             "trained",
@@ -203,5 +228,5 @@ class RunState:
         state: dict[str, Any] = json.loads(files["state.json"])
         self.student = Student.from_bytes(files["student.safetensors"])
         self.history, self.steps = state["history"], state["steps"]
-        self.restore_ledger(state["queries"])
+        self.take_up(state)
         return True

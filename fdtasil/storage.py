@@ -58,7 +58,8 @@ def write_folder(folder: Path, files: Mapping[str, bytes]) -> None:
     """Write files and a manifest with their sha256: all of them, or none.
 
     Args:
-        folder: Where; made if it is not there. Other files in it stay.
+        folder: Where; made if it is not there. Files that an earlier call wrote and this one does
+            not are removed at the end; other files in it stay.
         files: Content by name relative to `folder`.
 
     Raises:
@@ -67,6 +68,7 @@ def write_folder(folder: Path, files: Mapping[str, bytes]) -> None:
     """
     coming = folder / _COMING
     _move_in(folder)
+    old = _listed(folder)
     try:
         if coming.exists():
             shutil.rmtree(coming)
@@ -79,6 +81,17 @@ def write_folder(folder: Path, files: Mapping[str, bytes]) -> None:
     manifest = {name: sha256(data) for name, data in sorted(files.items())}
     write_bytes(coming / MANIFEST, to_json(manifest))
     _move_in(folder)
+    for name in old - files.keys():
+        (folder / name).unlink(missing_ok=True)
+
+
+def _listed(folder: Path) -> set[str]:
+    """Return what a folder's manifest lists; nothing where it can't be trusted to say."""
+    try:
+        names = json.loads((folder / MANIFEST).read_bytes())
+    except (OSError, ValueError):
+        return set()
+    return {name for name in names if stays_inside(name)} if isinstance(names, dict) else set()
 
 
 def verify(folder: Path) -> dict[str, bytes]:

@@ -4,6 +4,7 @@ import json
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from itertools import pairwise
+from numbers import Integral
 
 import numpy as np
 import safetensors.torch
@@ -58,7 +59,7 @@ def check_shape(hidden: Sequence[int], activation: str) -> None:
             f"one of {', '.join(ACTIVATIONS)}",
             'write for example activation="gelu"',
         )
-    if not all(isinstance(width, int) and width > 0 for width in hidden):
+    if not all(isinstance(width, Integral) and width > 0 for width in hidden):
         raise SettingError(f"hidden={hidden!r}", "positive integers", "write (256, 256)")
 
 

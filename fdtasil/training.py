@@ -14,7 +14,7 @@ from fdtasil.answers import Answers
 from fdtasil.demonstrations import Demonstrations
 from fdtasil.errors import FdtasilWarning
 from fdtasil.events import Callback, Event
-from fdtasil.fit import Hooks, fit
+from fdtasil.fit import Hooks, fit, hold_out
 from fdtasil.fitstate import FitState
 from fdtasil.interrupts import Interrupts
 from fdtasil.progress import Stages
@@ -55,8 +55,13 @@ class Training:
         seen = view.demonstrations(state.data.demonstrations)
         self._warn_of_one_episode(seen)
         resume, asked_pool = self._resumed(round_)
-        pools = _Pools(state, view, round_, asked_pool)
-        total = run.fit.total_steps(len(seen))
+        pools = _Asking(state, view, round_, asked_pool)
+
+        def random(name: str) -> torch.Generator:
+            return torch_generator(run.seed, "batches", round_, name)
+
+        rows, _ = hold_out(seen, run.fit, random("held out"))
+        total = run.fit.total_steps(len(rows))
         student = self._fresh(seen, round_)
         with self.stages.stage(f"training, round {round_}", total, "step") as move:
             entries = fit(
@@ -65,7 +70,7 @@ class Training:
                 state.source,
                 pools if state.source else None,
                 run.fit,
-                lambda name: torch_generator(run.seed, "batches", round_, name),
+                random,
                 order=run.order,
                 hooks=Hooks(self._tell(round_, move), self._checkpoint(round_, pools)),
                 resume=resume,
@@ -98,7 +103,7 @@ class Training:
         if saved is None:
             return None, -1
         about = json.loads(saved["state.json"])
-        self.state.restore_ledger(about["queries"])
+        self.state.take_up(about)
         return saved["fit.safetensors"], about["pool"]
 
     def _tell(
@@ -114,14 +119,14 @@ class Training:
 
         return tell
 
-    def _checkpoint(self, round_: int, pools: "_Pools") -> Callable[[FitState], None]:
+    def _checkpoint(self, round_: int, pools: "_Asking") -> Callable[[FitState], None]:
         due = time.monotonic() + CHECKPOINT_SECONDS
 
         def checkpoint(fitted: FitState) -> None:
             nonlocal due
             if time.monotonic() < due and not self.interrupts.due:
                 return
-            about = {"pool": pools.number, "queries": self.state.ledger()}
+            about = {"pool": pools.number, **self.state.so_far()}
             self.state.folder.save(
                 round_,
                 "training",
@@ -134,7 +139,7 @@ class Training:
         return checkpoint
 
 
-class _Pools:
+class _Asking:
     """The expert's answers by number of the pool: those stored, then those of new directions."""
 
     def __init__(self, state: RunState, view: View, round_: int, asked: int) -> None:

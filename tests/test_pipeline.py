@@ -156,7 +156,7 @@ def test_the_same_weight_means_the_same_for_every_number_of_probes(linear):
         ({"seed": -1}, "seed=-1"),
         ({"episodes": 0}, "episodes=0"),
         ({"horizon": 0}, "horizon=0"),
-        ({"evaluation_episodes": 0}, "evaluation_episodes=0"),
+        ({"evaluation_episodes": -1}, "evaluation_episodes=-1"),
         ({"device": "tpu"}, "device='tpu'"),
         ({"activation": "step"}, "activation='step'"),
         ({"probes": "spere:3"}, "spere:3"),
@@ -234,3 +234,28 @@ def test_a_resampling_source_stops_at_the_budget(linear, monkeypatch):
     with pytest.raises(SettingError, match="more are due"):
         fdtasil.distill(counted, TOY, "sphere:2,resample", max_queries=500, **QUICK)
     assert sum(asked) <= 500
+
+
+def test_no_evaluation_is_asked_for_and_none_is_made(linear):
+    result = fdtasil.distill(linear, TOY, 2, **{**QUICK, "evaluation_episodes": 0})
+    assert result.evaluation is None
+    assert result.queries["evaluate"] == 0
+    assert 0 < result.queries["check"] == result.report["predicted_queries"]["check"]
+
+
+def test_the_prediction_keeps_the_ladder_that_was_asked(linear):
+    """A central stencil was left open, and would have asked for a longer ladder than a forward."""
+    shape = {**QUICK, "episodes": 3, "horizon": 200}
+    report = fdtasil.distill(linear, TOY, 10, **shape).report
+    assert report["calibration"]["stencil"] == "forward"
+    assert report["queries"]["calibrate"] == report["predicted_queries"]["calibrate"] > 0
+
+
+def test_numbers_of_numpy_are_as_good_as_python_s(linear, tmp_path):
+    given = {"steps": np.int64(5), "hidden": np.int64(8), "weight": np.float32(0.5)}
+    plain = {"steps": 5, "hidden": 8, "weight": 0.5}
+    ours, theirs = (
+        fdtasil.distill(linear, TOY, 2, **{**QUICK, **numbers}).save(tmp_path / name)
+        for name, numbers in (("numpy", given), ("python", plain))
+    )
+    assert (ours / "config.json").read_bytes() == (theirs / "config.json").read_bytes()

@@ -136,3 +136,13 @@ def test_predicted_queries():
     assert Probes.parse("basis,central").queries(10, 7, visits=99) == 140
     assert Probes.parse("jacobian").queries(10, 7, visits=99) == 0
     assert Probes.parse("sphere:4,forward,resample").queries(10, 7, visits=9) == 3 * 40
+
+
+def test_a_system_at_rest_has_no_probes_of_no_length():
+    """Where many states are one, what lies nearest is the same state."""
+    time = np.arange(3000)
+    settling = np.stack([0.9**time, 0.5**time], axis=1).round(6)
+    states = (settling @ np.random.default_rng(0).standard_normal((2, 12))).astype(np.float32)
+    assert is_redundant(states)
+    bank, _ = AdaptiveDirections(10).draw(len(states), states, np.random.default_rng(1))
+    assert np.linalg.norm(bank, axis=1).min() > 0.01

@@ -125,3 +125,33 @@ def test_a_broken_checkpoint_is_named_and_an_earlier_one_used(expert, golden, tm
     with pytest.warns(FdtasilWarning, match=r"fit\.safetensors changed after writing"):
         fdtasil.distill(expert, TOY, resume=folder, **RUN)
     assert read(folder) == expected
+
+
+def test_a_run_that_asked_all_it_may_is_resumed(expert, tmp_path):
+    """What was asked again is no part of the budget, and the budget may be another."""
+    run = {**RUN, "probes": "sphere:2,forward"}
+    whole = fdtasil.distill(expert, TOY, **run).report["predicted_queries"]
+    budget = sum(whole.values())
+    for name, later in (("same", budget), ("higher", 2 * budget)):
+        folder = tmp_path / name
+        with pytest.raises(Stop):
+            fdtasil.distill(
+                expert, TOY, out=folder, callback=stop_at(2), max_queries=budget, **run
+            )
+        report = fdtasil.distill(expert, TOY, resume=folder, max_queries=later, **run).report
+        assert report["rows_asked_again_after_resuming"] > 0
+
+
+def test_warnings_of_the_interrupted_run_are_kept(expert, tmp_path):
+    run = {**RUN, "trainer": "bc", "probes": "sphere:2,radius=3e-7"}  # lost in rounding
+    with pytest.warns(FdtasilWarning, match="rounds away"), pytest.raises(Stop):
+        fdtasil.distill(expert, TOY, out=tmp_path / "run", callback=stop_at(2), **run)
+    with pytest.warns(FdtasilWarning, match="difference there is noise") as again:
+        report = fdtasil.distill(expert, TOY, resume=tmp_path / "run", **run).report
+    assert not any("rounds away" in str(one.message) for one in again)
+    assert any("rounds away" in note for note in report["warnings"])
+
+
+def test_a_resumed_run_stays_in_its_own_folder(expert, tmp_path):
+    with pytest.raises(SettingError, match="leave out= out"):
+        fdtasil.distill(expert, TOY, out=tmp_path / "a", resume=tmp_path / "b", **RUN)

@@ -111,3 +111,12 @@ def test_a_numpy_integer_is_a_seed(linear):
     assert type(first.settings["seed"]) is int
     second = fdtasil.distill(linear, TOY, 1, **QUICK, seed=3)
     assert first.student.to_bytes() == second.student.to_bytes()
+
+
+def test_files_that_are_no_more_written_go(tmp_path):
+    write_folder(tmp_path, {"kept": b"1", "figures/old.png": b"2"})
+    (tmp_path / "notes.txt").write_text("the user's own")
+    write_folder(tmp_path, {"kept": b"3"})
+    assert verify(tmp_path) == {"kept": b"3"}
+    assert not (tmp_path / "figures/old.png").exists()
+    assert (tmp_path / "notes.txt").exists()

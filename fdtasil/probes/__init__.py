@@ -11,7 +11,7 @@ from fdtasil.probes.directions import (
     RandomSphere,
     StandardBasis,
 )
-from fdtasil.probes.source import DIRECTIONS, Probes
+from fdtasil.probes.source import DIRECTIONS, USUAL_COUNT, Probes
 from fdtasil.probes.stencils import CENTRAL, EXACT, FORWARD, LABELS, STENCILS, Stencil
 
 __all__ = [
@@ -21,6 +21,7 @@ __all__ = [
     "FORWARD",
     "LABELS",
     "STENCILS",
+    "USUAL_COUNT",
     "AdaptiveDirections",
     "Directions",
     "OrthogonalFrames",

@@ -11,6 +11,7 @@ __all__ = ["AdaptiveDirections", "is_redundant"]
 _VARIANCE = 0.99
 _STATES = 2048  # looked at for excursions: enough for a bank, and 2048 x 2048 distances are quick
 _APART = 10  # rows: a state's neighbours in time are not where a student would drift to
+_SHORT = 0.01  # of an isotropic direction's length: asks the same question again
 _STRETCH = 2.0
 _MIXED = 3
 
@@ -47,7 +48,9 @@ class AdaptiveDirections:
         bank, numbers = RandomSphere(self.probes).draw(rows, states, random)
         if is_redundant(states):
             excursions = _excursions(states, len(bank), random)
-            chosen = random.random(len(bank)) < 0.5
+            # At rest nothing moves: what an excursion would waste there stays isotropic.
+            moves = np.linalg.norm(excursions, axis=1) > _SHORT
+            chosen = (random.random(len(bank)) < 0.5) & moves
             bank = np.where(chosen[:, None], excursions, bank)
         return bank, numbers
 

@@ -17,13 +17,16 @@ from fdtasil.probes.directions import (
 )
 from fdtasil.probes.stencils import CENTRAL, EXACT, FORWARD, LABELS, STENCILS, Stencil
 
-__all__ = ["DIRECTIONS", "Probes"]
+__all__ = ["DIRECTIONS", "USUAL_COUNT", "Probes"]
+
+USUAL_COUNT = 10
+"""Probes of a state, where nobody says another number."""
 
 DIRECTIONS: dict[str, Callable[[int | None], Directions]] = {
-    "adaptive": lambda count: AdaptiveDirections(10 if count is None else count),
+    "adaptive": lambda count: AdaptiveDirections(USUAL_COUNT if count is None else count),
     "basis": lambda count: StandardBasis(),
-    "sphere": lambda count: RandomSphere(10 if count is None else count),
-    "orthogonal": lambda count: OrthogonalFrames(10 if count is None else count),
+    "sphere": lambda count: RandomSphere(USUAL_COUNT if count is None else count),
+    "orthogonal": lambda count: OrthogonalFrames(USUAL_COUNT if count is None else count),
     "jacobian": lambda count: OrthogonalFrames(),
 }
 """Every design by the name it is written with; the count may be left open."""
