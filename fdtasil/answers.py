@@ -1,7 +1,7 @@
 """The expert's answers around demonstrated states: asked in bounded blocks, kept in one array."""
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,7 +12,7 @@ from fdtasil.experts import Expert, Purpose
 from fdtasil.probes import Probes
 from fdtasil.scales import Statistics
 
-__all__ = ["Answers", "ask_moved", "ask_probes"]
+__all__ = ["Answers", "Asking", "ask_moved", "ask_probes"]
 
 # States that a design is shown: enough to tell which displacements can occur.
 _SHOWN = 4096
@@ -57,6 +57,19 @@ class Answers:
         )
 
 
+@dataclass(frozen=True)
+class Asking:
+    """How an asking that takes long is followed, and goes on.
+
+    Attributes:
+        known: (S, k, p, m) what an interrupted asking had of the first S states, or None.
+        told: Given the (S, k, p, m) answers so far and how many states of them are new.
+    """
+
+    known: np.ndarray | None
+    told: Callable[[np.ndarray, int], None]
+
+
 def ask_probes(
     expert: Expert,
     observations: np.ndarray,
@@ -64,6 +77,7 @@ def ask_probes(
     scales: Statistics,
     random: np.random.Generator,
     order: int = 1,
+    asking: Asking | None = None,
 ) -> Answers:
     """Ask the expert around each state.
 
@@ -74,6 +88,7 @@ def ask_probes(
         scales: Of the demonstrations.
         random: Draws the directions.
         order: 1, or 2 for exact second derivatives too; a finite stencil has them in its values.
+        asking: Who follows it; nobody does where derivatives are exact.
 
     Raises:
         ExpertError: If the stencil is exact and the expert can't be differentiated.
@@ -81,7 +96,7 @@ def ask_probes(
             the answers do not fit into memory.
     """
     try:
-        return _ask_probes(expert, observations, probes, scales, random, order)
+        return _ask_probes(expert, observations, probes, scales, random, order, asking)
     except MemoryError as error:
         raise SettingError(
             f"{probes.describe()!r} at {len(observations):,} states does not fit into memory",
@@ -114,6 +129,7 @@ def _ask_probes(
     scales: Statistics,
     random: np.random.Generator,
     order: int,
+    asking: Asking | None,
 ) -> Answers:
     deviation = 1.0 if probes.space == "raw" else scales.deviation
     step_scale = np.where(scales.probed(probes.space), deviation, 0.0)
@@ -133,7 +149,8 @@ def _ask_probes(
     if probes.stencil.exact:
         values = differentiate(expert, observations, displacements, numbers, order)
     else:
-        values = _ask_values(expert, observations, displacements, numbers, probes.stencil.offsets)
+        offsets = probes.stencil.offsets
+        values = _ask_values(expert, observations, displacements, numbers, offsets, asking)
     return Answers(displacements, numbers, values, gain)
 
 
@@ -143,13 +160,19 @@ def _ask_values(
     displacements: np.ndarray,
     numbers: np.ndarray,
     offsets: Sequence[float],
+    asking: Asking | None,
 ) -> np.ndarray:
     """Ask for the values at the stencil's points, a bounded number of rows at a time."""
     states, count = numbers.shape
     block = max(1, _ROWS // (count * len(offsets)))
     shifts = np.asarray(offsets, np.float32)[:, None]
-    values: np.ndarray | None = None
-    for start in range(0, states, block):
+    values, done = None, 0
+    if asking is not None and asking.known is not None:
+        known, done = asking.known, len(asking.known)
+        values = np.empty((states, *known.shape[1:]), np.float32)
+        values[:done] = known
+        asking.told(values[:done], done)
+    for start in range(done, states, block):
         rows = slice(start, start + block)
         moved = displacements[numbers[rows]][:, :, None, :] * shifts
         points = observations[rows, None, None, :] + moved
@@ -159,6 +182,8 @@ def _ask_values(
             values = np.empty((states, count, len(offsets), answers.shape[1]), np.float32)
             _announce(values)
         values[rows] = answers.reshape(*points.shape[:3], -1)
+        if asking is not None:
+            asking.told(values[: start + len(points)], len(points))
     assert values is not None, "there is no demonstration without a state"
     return values
 

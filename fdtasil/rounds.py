@@ -2,6 +2,9 @@
 
 from dataclasses import dataclass, replace
 
+import numpy as np
+
+from fdtasil.answers import Answers
 from fdtasil.behaviours import Behaviour
 from fdtasil.datasets import Dataset
 from fdtasil.demonstrations import label
@@ -44,7 +47,7 @@ class Rounds:
                 if run.trainer:
                     self._collect(round_, count)
                 elif run.probes and not run.probes_given:
-                    self._probe_given()
+                    self._probe(state.data.demonstrations.observations, 0, None)
                 state.keep_collected(round_)
             if not state.restore_trained(round_):
                 with self.training.interrupts.held_back():
@@ -55,6 +58,21 @@ class Rounds:
 
     def _collect(self, round_: int, count: int) -> None:
         """Record `count` episodes, label their states and ask the probes around them."""
+        state, before = self.state, self.state.dataset
+        recorded = state.restore_recorded(round_)
+        if recorded is None:
+            recorded = self._labelled(round_, count)
+            if state.run.probes is not None:  # else the round is kept as a whole in a moment
+                state.keep_recorded(round_, recorded)
+        new, state.dataset, old = recorded.demonstrations, recorded, None
+        if before is not None:
+            state.dataset = replace(before, demonstrations=before.demonstrations + new)
+            old = before.answers
+        if state.run.probes is not None:
+            self._probe(new.observations, round_, old)
+
+    def _labelled(self, round_: int, count: int) -> Dataset:
+        """Record `count` episodes and label their states."""
         state, pool = self.state, self.pool
         assert state.expert is not None
         assert pool is not None
@@ -65,16 +83,15 @@ class Rounds:
             check_episodes(recorded, pool.name)
         new = label(recorded, state.expert, state.episodes, round_)
         state.count(recorded)
-        before, old = state.dataset, None
-        state.dataset = Dataset(new, None, None, pool.boxes.low, pool.boxes.high, pool.name)
-        if before is not None:
-            state.dataset = replace(before, demonstrations=before.demonstrations + new)
-            old = before.answers
-        if state.run.probes is not None:
-            state.calibrate()
-            answers = state.ask(new.observations, round_, 0)
-            answers = old + answers if old is not None else answers
-            state.dataset = replace(state.dataset, probes=state.source, answers=answers)
+        return Dataset(new, None, None, pool.boxes.low, pool.boxes.high, pool.name)
+
+    def _probe(self, observations: np.ndarray, round_: int, old: Answers | None) -> None:
+        """Ask the probes around states, and join the answers to those of earlier rounds."""
+        state = self.state
+        with self.training.stages.stage("probes", len(observations), "state") as move:
+            answers = state.ask_collected(observations, round_, move)
+        answers = old + answers if old is not None else answers
+        state.dataset = replace(state.data, probes=state.source, answers=answers)
 
     def _behaviour(self, pool: EnvironmentPool, round_: int) -> Behaviour:
         """Return who acts in a round, which may take a few more episodes to find out."""
@@ -87,13 +104,6 @@ class Rounds:
 
         policy = state.view.policy(state.student.act) if state.student else None
         return trainer.behaviour(Situation(round_, state.expert, policy, record_extra))
-
-    def _probe_given(self) -> None:
-        """Ask the probes around given states."""
-        state = self.state
-        state.calibrate()
-        answers = state.ask(state.data.demonstrations.observations, 0, 0)
-        state.dataset = replace(state.data, probes=state.source, answers=answers)
 
     def _record(
         self, pool: EnvironmentPool, behaviour: Behaviour, stream: str, first: int, count: int

@@ -2,6 +2,7 @@
 
 import json
 import shutil
+import time
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -12,7 +13,10 @@ from fdtasil.errors import FdtasilWarning, SettingError, StorageError
 from fdtasil.lock import locked
 from fdtasil.storage import is_written, to_json, verify, write_bytes, write_folder
 
-__all__ = ["RunFolder", "open_run_folder"]
+__all__ = ["CHECKPOINT_SECONDS", "RunFolder", "open_run_folder"]
+
+CHECKPOINT_SECONDS = 20.0
+"""Time between two checkpoints inside a stage; when they are taken changes no byte."""
 
 _CONFIG = "config.json"
 _CHECKPOINTS = "checkpoints"
@@ -73,6 +77,12 @@ class RunFolder:
 
     def __init__(self, path: Path | None, config: dict[str, Any]) -> None:
         self._path, self._config = path, config
+        self._saved = time.monotonic()
+
+    @property
+    def due(self) -> bool:
+        """Whether enough would be lost by now to be worth a checkpoint."""
+        return self._path is not None and time.monotonic() - self._saved >= CHECKPOINT_SECONDS
 
     @property
     def begun(self) -> bool:
@@ -105,6 +115,7 @@ class RunFolder:
         for older in _numbered(place, stage):
             if older.name != f"{stage}-{number}":
                 shutil.rmtree(older, ignore_errors=True)
+        self._saved = time.monotonic()
 
     def load(self, round_: int, stage: str) -> dict[str, bytes] | None:
         """Return the newest whole checkpoint of a stage, or None."""

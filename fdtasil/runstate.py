@@ -1,14 +1,16 @@
 """What grows from round to round of a run: how it is kept, and taken up again."""
 
+import io
 import json
 import time
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
 
-from fdtasil.answers import Answers, ask_probes
+from fdtasil.answers import Answers, Asking, ask_probes
 from fdtasil.calibration import Calibration, calibrate
 from fdtasil.configuration import Configuration
 from fdtasil.datasets import Dataset
@@ -117,7 +119,53 @@ class RunState:
         )
         self.calibration, self.source = found, found.complete(run.probes)
 
-    def ask(self, observations: np.ndarray, *path: int) -> Answers:
+    def ask_collected(
+        self, observations: np.ndarray, round_: int, move: Callable[[int], None]
+    ) -> Answers:
+        """Ask the probes around a round's states, in the first one after a calibration.
+
+        The answers are kept on the way.
+
+        Args:
+            observations: (N, n) the states.
+            round_: The round.
+            move: Told of the states that are done.
+        """
+        known = self._restore_asked(round_)
+        self.calibrate()
+
+        def told(values: np.ndarray, states: int) -> None:
+            move(states)
+            if self.folder.due:
+                about = {"calibration": self._calibration_json(), **self.so_far()}
+                self.folder.save(
+                    round_,
+                    "asked",
+                    len(values),
+                    lambda: {"values.npy": _npy(values), "state.json": to_json(about)},
+                )
+
+        return self.ask(observations, round_, 0, asking=Asking(known, told))
+
+    def _restore_asked(self, round_: int) -> np.ndarray | None:
+        """Take up the answers of an asking that was interrupted, if there are any."""
+        files = self.folder.load(round_, "asked")
+        if files is None:
+            return None
+        state: dict[str, Any] = json.loads(files["state.json"])
+        self._restore_calibration(state["calibration"])
+        self.take_up(state)
+        return np.load(io.BytesIO(files["values.npy"]), allow_pickle=False)
+
+    def _calibration_json(self) -> dict[str, Any] | None:
+        return self.calibration.to_json() if self.calibration else None
+
+    def _restore_calibration(self, kept: dict[str, Any] | None) -> None:
+        if kept and self.calibration is None and self.run.probes is not None:
+            self.calibration = Calibration.from_json(kept)
+            self.source = self.calibration.complete(self.run.probes)
+
+    def ask(self, observations: np.ndarray, *path: int, asking: Asking | None = None) -> Answers:
         """Ask the probes around states, along the directions of a named stream.
 
         Raises:
@@ -132,12 +180,13 @@ class RunState:
                 "an expert, or demonstrations with stored answers",
                 "pass the expert, or probes=0 for plain behaviour cloning",
             )
-        scales = self.scales
-        self._check_budget(
-            probes.queries(len(observations), int(scales.probed(probes.space).sum()), 1)
-        )
-        random = generator(self.run.seed, "probes", *path)
-        return ask_probes(expert, observations, probes, scales, random, self.run.order)
+        scales, known = self.scales, 0
+        if asking is not None and asking.known is not None:
+            known = len(asking.known)
+        moving = int(scales.probed(probes.space).sum())
+        self._check_budget(probes.queries(len(observations) - known, moving, 1))
+        random, order = generator(self.run.seed, "probes", *path), self.run.order
+        return ask_probes(expert, observations, probes, scales, random, order, asking)
 
     def _check_budget(self, rows: int) -> None:
         """Refuse to ask beyond the budget: early ends make a resampling source ask more often."""
@@ -181,12 +230,32 @@ class RunState:
         self.expert.queries.update(queries)
         self.expert.queries["again"] += self.again
 
+    def keep_recorded(self, round_: int, new: Dataset) -> None:
+        """Keep what a round has recorded, before its probes are asked."""
+        about = {"episodes": self.episodes, "counts": self.counts, **self.so_far()}
+        self.folder.save(
+            round_,
+            "recorded",
+            0,
+            lambda: {"demonstrations.npz": new.to_bytes(), "state.json": to_json(about)},
+        )
+
+    def restore_recorded(self, round_: int) -> Dataset | None:
+        """Take up what a round of the interrupted run recorded, if it did."""
+        files = self.folder.load(round_, "recorded")
+        if files is None:
+            return None
+        state: dict[str, Any] = json.loads(files["state.json"])
+        self.episodes, self.counts = state["episodes"], Counter(state["counts"])
+        self.take_up(state)
+        return Dataset.from_bytes(files["demonstrations.npz"])
+
     def keep_collected(self, round_: int) -> None:
         """Keep what a round has recorded and asked."""
         about = {
             "episodes": self.episodes,
             "counts": self.counts,
-            "calibration": self.calibration.to_json() if self.calibration else None,
+            "calibration": self._calibration_json(),
             **self.so_far(),
         }
         self.folder.save(
@@ -205,9 +274,7 @@ class RunState:
         self.dataset = Dataset.from_bytes(files["demonstrations.npz"])
         self.episodes, self.counts = state["episodes"], Counter(state["counts"])
         self.take_up(state)
-        if state["calibration"] and self.calibration is None and self.run.probes is not None:
-            self.calibration = Calibration.from_json(state["calibration"])
-            self.source = self.calibration.complete(self.run.probes)
+        self._restore_calibration(state["calibration"])
         return True
 
     def keep_trained(self, round_: int) -> None:
@@ -230,3 +297,9 @@ class RunState:
         self.history, self.steps = state["history"], state["steps"]
         self.take_up(state)
         return True
+
+
+def _npy(values: np.ndarray) -> bytes:
+    target = io.BytesIO()
+    np.save(target, values, allow_pickle=False)
+    return target.getvalue()

@@ -1,7 +1,6 @@
 """One round's training: a fresh student, on all that the run has, with checkpoints."""
 
 import json
-import time
 import warnings
 from collections import Counter
 from collections.abc import Callable
@@ -25,10 +24,7 @@ from fdtasil.storage import to_json
 from fdtasil.student import Student, StudentShape
 from fdtasil.views import View
 
-__all__ = ["CHECKPOINT_SECONDS", "Training"]
-
-CHECKPOINT_SECONDS = 20.0
-"""Time between two checkpoints inside a training; when they are taken changes no byte."""
+__all__ = ["Training"]
 
 
 @dataclass(frozen=True)
@@ -120,11 +116,8 @@ class Training:
         return tell
 
     def _checkpoint(self, round_: int, pools: "_Asking") -> Callable[[FitState], None]:
-        due = time.monotonic() + CHECKPOINT_SECONDS
-
         def checkpoint(fitted: FitState) -> None:
-            nonlocal due
-            if time.monotonic() < due and not self.interrupts.due:
+            if not self.state.folder.due and not self.interrupts.due:
                 return
             about = {"pool": pools.number, **self.state.so_far()}
             self.state.folder.save(
@@ -134,7 +127,6 @@ class Training:
                 lambda: {"fit.safetensors": fitted.to_bytes(), "state.json": to_json(about)},
             )
             self.interrupts.stop_if_due()
-            due = time.monotonic() + CHECKPOINT_SECONDS
 
         return checkpoint
 

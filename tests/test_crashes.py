@@ -19,7 +19,7 @@ from conftest import QUICK, TOY, mlp_onnx
 from test_resume import FILES, Stop, read, stop_at
 
 import fdtasil
-from fdtasil import training
+from fdtasil import runfolder
 from fdtasil.errors import FdtasilWarning, StorageError
 
 RUN = {**QUICK, "trainer": "dagger", "probes": "sphere:2,resample", "episodes": 6, "steps": 150}
@@ -31,8 +31,8 @@ import json, os, signal, sys, traceback
 import gymnasium, matplotlib.figure, onnx, onnxruntime, torch
 torch.set_num_threads(1)
 import fdtasil
-from fdtasil import training
-training.CHECKPOINT_SECONDS = 0.05
+from fdtasil import runfolder
+runfolder.CHECKPOINT_SECONDS = 0.05
 for line in sys.stdin:
     order = json.loads(line)
     child = os.fork()
@@ -232,7 +232,7 @@ def states(expert, tmp_path_factory):
 @pytest.mark.parametrize("forever", [False, True])
 def test_any_write_may_fail(every, forever, expert, states, tmp_path, monkeypatch, figure):
     """The n-th write fails for every n: the old run or the new one, never anything between."""
-    monkeypatch.setattr(training, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(runfolder, "CHECKPOINT_SECONDS", 0.0)
     old, new = map(read, states)
     failed = 0
     for nth in itertools.count(1, every):

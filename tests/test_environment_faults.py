@@ -481,9 +481,9 @@ import ctypes, os, sys, time
 import torch
 torch.set_num_threads(1)
 import fdtasil
-from fdtasil import training
+from fdtasil import runfolder
 from test_environment_faults import Odd
-training.CHECKPOINT_SECONDS = 0.0
+runfolder.CHECKPOINT_SECONDS = 0.0
 folder, how = sys.argv[1:]
 steps = []
 

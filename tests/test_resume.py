@@ -6,7 +6,7 @@ import pytest
 from conftest import QUICK, TOY, mlp_onnx
 
 import fdtasil
-from fdtasil import training
+from fdtasil import runfolder
 from fdtasil.errors import FdtasilWarning, SettingError
 
 FILES = (
@@ -25,7 +25,7 @@ class Stop(Exception):
 
 @pytest.fixture(autouse=True)
 def checkpoint_at_every_epoch(monkeypatch):
-    monkeypatch.setattr(training, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(runfolder, "CHECKPOINT_SECONDS", 0.0)
 
 
 @pytest.fixture(scope="module")
@@ -155,3 +155,31 @@ def test_warnings_of_the_interrupted_run_are_kept(expert, tmp_path):
 def test_a_resumed_run_stays_in_its_own_folder(expert, tmp_path):
     with pytest.raises(SettingError, match="leave out= out"):
         fdtasil.distill(expert, TOY, out=tmp_path / "a", resume=tmp_path / "b", **RUN)
+
+
+@pytest.mark.parametrize("kept", [0, 1, 3])
+def test_stopped_while_the_probes_are_asked_nothing_is_lost(kept, tmp_path, monkeypatch):
+    """Demonstrations are kept before the probes, and the answers on the way, block by block."""
+    monkeypatch.setattr("fdtasil.answers._ROWS", 500)
+    run = {**QUICK, "episodes": 5, "horizon": 40, "probes": "sphere:10,forward"}
+    blocks, last, acting = 0, None, 0
+
+    def expert(observations):
+        nonlocal blocks, acting
+        if len(observations) == 500:  # nothing else is as long
+            if blocks == last:
+                raise KeyboardInterrupt
+            blocks += 1
+        acting += len(observations) < 10
+        return observations[:, :2] * 0.1
+
+    whole = fdtasil.distill(expert, TOY, out=tmp_path / "whole", **run)
+    assert (blocks, acting > 40) == (4, True)
+    blocks, last = 0, kept
+    with pytest.raises(KeyboardInterrupt):
+        fdtasil.distill(expert, TOY, out=tmp_path / "run", **run)
+    blocks, last, acting = 0, None, 0
+    resumed = fdtasil.distill(expert, TOY, resume=tmp_path / "run", **run)
+    assert blocks == 4 - kept
+    assert read(tmp_path / "run") == read(tmp_path / "whole")
+    assert resumed.queries == whole.queries

@@ -10,7 +10,7 @@ import torch
 from conftest import QUICK, TOY
 
 import fdtasil
-from fdtasil import training
+from fdtasil import runfolder
 from fdtasil.errors import ExpertError, FitError, SettingError
 
 WHOLE = {"steps": 40, "hidden": 8}
@@ -139,7 +139,7 @@ def test_a_training_that_diverges_leaves_no_number_that_is_not_finite(
     rate, batch_size, linear, tmp_path, monkeypatch
 ):
     """Checkpoints are taken at every epoch here, the history looks at each hundredth step."""
-    monkeypatch.setattr(training, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(runfolder, "CHECKPOINT_SECONDS", 0.0)
     entries = []
     run = {**QUICK, "steps": 300, "batch_size": batch_size, "learning_rate": rate}
     with pytest.raises(FitError, match=r"at step|after step") as error:
@@ -168,7 +168,7 @@ def test_a_student_that_was_spoilt_is_not_saved(quick, tmp_path):
 @pytest.mark.parametrize("after", [1500, 2500, 3000])
 def test_an_expert_that_fails_late_leaves_a_run_that_goes_on(after, linear, tmp_path, monkeypatch):
     """In the questions of the second round, while training, or in the evaluation."""
-    monkeypatch.setattr(training, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(runfolder, "CHECKPOINT_SECONDS", 0.0)
     run = {**QUICK, "trainer": "dagger", "episodes": 3, "steps": 60, "probes": "sphere:4,resample"}
     asked = 0
 
