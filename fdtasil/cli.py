@@ -1,15 +1,20 @@
 """The same functions from a shell; every default and help text is read from them."""
 
 import json
+import os
 import sys
-from collections.abc import Callable
+import warnings
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
+from importlib.metadata import version
+from inspect import signature
 from pathlib import Path
 from typing import Any
 
 import tyro
 
 from fdtasil.distilled import Distilled
-from fdtasil.errors import FdtasilError, SettingError
+from fdtasil.errors import FdtasilError, FdtasilWarning, SettingError
 from fdtasil.evaluation import interval_text, score_text
 from fdtasil.inspection import inspect_expert
 from fdtasil.lock import locked
@@ -23,7 +28,7 @@ from fdtasil.shell import (
     PolicyPath,
     as_command,
 )
-from fdtasil.storage import to_json, write_bytes
+from fdtasil.storage import is_written, to_json, write_bytes
 
 __all__ = ["COMMANDS", "main"]
 
@@ -33,20 +38,72 @@ COMMAND = "command.json"
 
 def _distill(compare: bool, **arguments: Any) -> None:
     resume = arguments["resume"]
-    if resume is not None and arguments["expert"] is None and arguments["env"] is None:
-        arguments = {**_remembered(resume), "resume": resume}
-    elif resume is None and not (arguments["out"] / "checkpoints").exists():
-        plain = {k: str(v) if isinstance(v, Path) else v for k, v in arguments.items()}
-        with locked(arguments["out"]):  # another run's arguments stay its own
-            write_bytes(arguments["out"] / COMMAND, to_json(plain))
-    if resume is not None:
+    if resume is None:
+        with _remembering(arguments):
+            result, out = distill(**arguments), arguments["out"]
+    else:
+        if arguments["expert"] is None and arguments["env"] is None:
+            _check_alone(arguments)
+            arguments = {**_remembered(resume), "resume": resume}
         arguments["out"] = None  # a resumed run stays in its own folder
-    result, out = distill(**arguments), resume or arguments["out"]
+        result, out = distill(**arguments), resume
     plainly = {**arguments, "probes": 0, "out": None, "resume": None, "log_formats": ()}
     print(_side_by_side(result, distill(**plainly) if compare else None))
     asked = ", ".join(f"{name} {rows:,}" for name, rows in result.queries.items() if rows)
     print(f"rows asked of the expert: {asked}")
     print(f"saved in {out}: student.onnx, student.safetensors, report.json, figures/, ...")
+
+
+@contextmanager
+def _remembering(arguments: dict[str, Any]) -> Iterator[None]:
+    """Keep the arguments of a run beside it, for `--resume`; not those of one that never began."""
+    folder: Path = arguments["out"]
+    if (folder / "checkpoints").exists():  # of another run, which is refused in a moment
+        yield
+        return
+    if is_written(folder):
+        print(f"{folder} holds a finished run, which this one replaces", file=sys.stderr)
+    path, plain = (
+        folder / COMMAND,
+        {
+            name: str(value) if isinstance(value, Path) else value
+            for name, value in arguments.items()
+        },
+    )
+    with locked(folder):  # another run's arguments stay its own
+        before = path.read_bytes() if path.exists() else None
+        write_bytes(path, to_json(plain))
+    try:
+        yield
+    except BaseException:
+        if not (folder / "checkpoints").exists():
+            if before is None:
+                path.unlink(missing_ok=True)
+                with suppress(OSError):  # only an empty folder goes
+                    folder.rmdir()
+            else:
+                write_bytes(path, before)
+        raise
+
+
+def _check_alone(arguments: dict[str, Any]) -> None:
+    """Refuse arguments beside a `--resume` that remembers them all.
+
+    Raises:
+        SettingError: If there are some.
+    """
+    usual = {name: p.default for name, p in signature(COMMANDS["distill"]).parameters.items()}
+    given = [
+        f"--{name.replace('_', '-')}"
+        for name, value in arguments.items()
+        if name != "resume" and value != usual[name]
+    ]
+    if given:
+        raise SettingError(
+            f"{', '.join(given)} beside --resume {arguments['resume']}",
+            "--resume alone: a run goes on as it was begun",
+            "leave them out, or begin another run with --out",
+        )
 
 
 def _remembered(folder: Path) -> dict[str, Any]:
@@ -60,7 +117,7 @@ def _remembered(folder: Path) -> dict[str, Any]:
         arguments = json.loads((folder / COMMAND).read_bytes())
     except (OSError, ValueError) as error:
         raise SettingError(
-            f"{folder} has no {COMMAND} ({type(error).__name__})",
+            f"{folder / COMMAND} can't be read ({type(error).__name__})",
             "a folder that `fdtasil distill --out` has begun",
             f"repeat the arguments: fdtasil distill EXPERT ENV ... --resume {folder}",
         ) from error
@@ -149,6 +206,28 @@ COMMANDS: dict[str, Callable[..., None]] = {
 
 def main() -> None:
     """Run the command line; exit code 0 done, 1 failed, 2 wrong use, 128 + N signal N."""
+    if sys.argv[1:] == ["--version"]:
+        print(f"fdtasil {version('fdtasil')}")
+        return
+    sys.path.append(os.getcwd())  # `module:Id` may lie where the user is, as with `python -m`
+    with warnings.catch_warnings():
+        warnings.showwarning = _plainly(warnings.showwarning)
+        _run()
+
+
+def _plainly(shown: Callable[..., None]) -> Callable[..., None]:
+    """Show the library's own warnings as a shell's user reads them, without a line of source."""
+
+    def show(message: Warning | str, category: type[Warning], *where: Any) -> None:
+        if issubclass(category, FdtasilWarning):
+            print(f"fdtasil: warning: {message}", file=sys.stderr)
+        else:
+            shown(message, category, *where)
+
+    return show
+
+
+def _run() -> None:
     try:
         tyro.extras.subcommand_cli_from_dict(
             COMMANDS, prog="fdtasil", description="Distil a black-box controller.", config=()

@@ -13,6 +13,7 @@ from fdtasil.answers import Answers
 from fdtasil.demonstrations import Demonstrations
 from fdtasil.errors import SettingError, StorageError
 from fdtasil.probes import Probes
+from fdtasil.storage import is_written, verify
 
 __all__ = ["Dataset", "DatasetLike", "load_dataset"]
 
@@ -107,9 +108,13 @@ def load_dataset(source: DatasetLike) -> Dataset:
     path = Path(source)
     file = path / "demonstrations.npz" if path.is_dir() else path
     try:
-        return _checked(Dataset.from_bytes(file.read_bytes()))
+        whole = path.is_dir() and is_written(path)
+        return _checked(
+            Dataset.from_bytes(verify(path)[file.name] if whole else file.read_bytes())
+        )
     except OSError as error:
         if isinstance(error, StorageError):
+            error.add_note(f"read from {file}")
             raise
         raise StorageError(
             f"{file} can't be read: {error.strerror}",

@@ -27,7 +27,7 @@ __all__ = ["Distilled"]
 _PARITY_STATES = 1000
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Distilled:
     """A student, and how it came to be.
 
@@ -63,6 +63,17 @@ class Distilled:
     report: dict[str, Any]
     dataset: Dataset
     view: View
+
+    def __repr__(self) -> str:
+        """Return what a notebook shows of it."""
+        asked = ", ".join(f"{name} {rows:,}" for name, rows in self.queries.items() if rows)
+        lines = [
+            f"{self.report['env']}: {len(self.demonstrations):,} states, probes "
+            f"{self.report['probes']}, {self.report['steps']:,} steps",
+            f"asked of the expert: {asked or 'nothing'}",
+            "trained without an evaluation" if self.evaluation is None else str(self.evaluation),
+        ]
+        return "\n".join(lines)
 
     @property
     def demonstrations(self) -> Demonstrations:

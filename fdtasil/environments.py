@@ -56,11 +56,16 @@ class EnvironmentPool:
 
     def __init__(self, environment: EnvironmentLike) -> None:
         self._owned = not isinstance(environment, gymnasium.Env)
+        self._advice = (
+            "try gymnasium.make(...) on its own; ids of other packages are 'module:Id'"
+            if isinstance(environment, str)
+            else "call it on its own; an expert comes before the environment"
+        )
         self._make = _factory(environment)
         first = self._new()
         self._members = [first]
         self.name = first.spec.id if first.spec else type(first.unwrapped).__name__
-        self.time_limit = first.spec.max_episode_steps if first.spec else None
+        self.time_limit = _time_limit(first)
         self.boxes = _read_boxes(first, self.name)
 
     def take(self, count: int) -> list[gymnasium.Env]:
@@ -99,8 +104,8 @@ class EnvironmentPool:
             first_line = (str(error).splitlines() or [type(error).__name__])[0]
             raise EnvironmentFault(
                 f"the environment can't be made: {first_line}",
-                "a gymnasium id, an environment, or a function that makes one",
-                "try gymnasium.make(...) on its own; ids of other packages are 'module:Id'",
+                "a gymnasium id, an environment, or a function without arguments that makes one",
+                self._advice,
             ) from error
         if not isinstance(made, gymnasium.Env):
             raise EnvironmentFault(
@@ -112,7 +117,7 @@ class EnvironmentPool:
 
 
 def resolve_horizon(horizon: int | None, pool: EnvironmentPool) -> int:
-    """Return the number of steps after which an episode is cut.
+    """Return the number of steps after which an episode is cut, by us or by the environment.
 
     Raises:
         SettingError: If it is not a positive integer, or neither the caller nor the environment
@@ -126,6 +131,14 @@ def resolve_horizon(horizon: int | None, pool: EnvironmentPool) -> int:
             "a positive number of steps, or an environment with a time limit of its own",
             "write for example horizon=300",
         )
+    limit = pool.time_limit
+    if limit is not None and horizon > limit:
+        warnings.warn(
+            f"horizon={horizon}: {pool.name} ends its episodes at {limit} steps, which is used",
+            FdtasilWarning,
+            stacklevel=3,
+        )
+        return limit
     return int(horizon)
 
 
@@ -166,6 +179,17 @@ def _factory(environment: EnvironmentLike) -> Callable[[], gymnasium.Env]:
     )
 
 
+def _time_limit(environment: gymnasium.Env) -> int | None:
+    """Return the least number of steps after which the environment itself cuts an episode."""
+    limits = [environment.spec.max_episode_steps] if environment.spec else []
+    layer = environment
+    while isinstance(layer, gymnasium.Wrapper):
+        if isinstance(layer, gymnasium.wrappers.TimeLimit):
+            limits.append(layer._max_episode_steps)  # it has no other name
+        layer = layer.env
+    return min((limit for limit in limits if limit), default=None)
+
+
 def _read_boxes(environment: gymnasium.Env, name: str) -> Boxes:
     observation = _flat_box(environment.observation_space, name, "observations")
     action = _flat_box(environment.action_space, name, "actions")
@@ -187,11 +211,13 @@ def _bound(bound: np.ndarray) -> np.ndarray:
 
 
 def _flat_box(space: gymnasium.Space, name: str, role: str) -> gymnasium.spaces.Box:
+    wrapper = "FlattenObservation"
     if isinstance(space, gymnasium.spaces.Box) and len(space.shape) == 1 and space.shape[0] > 0:
         if np.issubdtype(space.dtype, np.floating):
             return space
+        wrapper = "DtypeObservation(env, np.float32)"
     advice = {
-        "observations": "wrap the environment in gymnasium.wrappers.FlattenObservation",
+        "observations": f"wrap the environment in gymnasium.wrappers.{wrapper}",
         "actions": "fdtasil distils continuous controllers; choose or wrap the environment so",
     }
     raise EnvironmentFault(

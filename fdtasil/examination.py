@@ -2,6 +2,8 @@
 
 import warnings
 
+import numpy as np
+
 from fdtasil.behaviours import follow
 from fdtasil.configuration import GATE_STATES
 from fdtasil.environments import EnvironmentPool
@@ -65,6 +67,14 @@ def check_first(
         ExpertError: If it fails a check.
     """
     first = first_observations(pool, [starts[e % len(starts)] for e in range(GATE_STATES)])
+    if not np.array_equal(first_observations(pool, starts[:1])[0], first[0]):
+        warnings.warn(
+            f"{pool.name} does not start from the same observation twice with one seed, so equal "
+            "runs differ, and expert and student are not compared from the same starts: seed it "
+            "in reset(), and take off wrappers with a memory (NormalizeObservation)",
+            FdtasilWarning,
+            stacklevel=5,
+        )
     _announce(check_expert(expert, first, pool.boxes, force=force), rows)
 
 

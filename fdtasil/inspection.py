@@ -37,7 +37,7 @@ def inspect_expert(
     """Show what an expert is: its contract with the environment, and the return it reaches.
 
     Args:
-        expert: ONNX file.
+        expert: ONNX file, zip of a stable-baselines3 agent, or address.
         env: Gymnasium id (module:Id imports the module first).
         output: Name of the ONNX output with the actions.
         episodes: Episodes that the return is measured over.

@@ -39,6 +39,7 @@ _SIZE_LIMIT = 2**30
 # Whose operators come with onnxruntime; the others are in libraries of native code.
 _DOMAINS = ("ai.onnx", "com.microsoft")
 
+_ENDS = (".zip", ".onnx")  # which stable-baselines3 and users leave out
 _IMPOSTORS = {
     b"<": ("an HTML or XML page", "download the file itself, not the page about it"),
     b"version https://git-lfs": ("a git-LFS pointer", "run `git lfs pull`"),
@@ -267,10 +268,13 @@ def _read_bytes(path: Path) -> bytes:
             )
         return path.read_bytes()
     except OSError as error:
+        beside = [
+            p.name for p in (path.with_name(f"{path.name}{end}") for end in _ENDS) if p.exists()
+        ]
         raise ExpertError(
             f"{path.absolute()} can't be read: {error.strerror}",
             f"an ONNX file (relative paths start at {Path.cwd()})",
-            "check the path",
+            f"name it whole: {beside[0]}" if beside else "check the path",
         ) from error
 
 

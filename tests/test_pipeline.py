@@ -245,7 +245,7 @@ def test_no_evaluation_is_asked_for_and_none_is_made(linear):
 
 def test_the_prediction_keeps_the_ladder_that_was_asked(linear):
     """A central stencil was left open, and would have asked for a longer ladder than a forward."""
-    shape = {**QUICK, "episodes": 3, "horizon": 200}
+    shape = {**QUICK, "episodes": 15, "horizon": 40}
     report = fdtasil.distill(linear, TOY, 10, **shape).report
     assert report["calibration"]["stencil"] == "forward"
     assert report["queries"]["calibrate"] == report["predicted_queries"]["calibrate"] > 0

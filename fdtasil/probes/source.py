@@ -193,7 +193,9 @@ def _parse_text(spec: str) -> Probes:
     design, *options = (part.strip() for part in spec.split(","))
     match = re.fullmatch(r"([a-z]+)(?::(\d+|all))?", design)
     if not match or match[1] not in DIRECTIONS or match[2] == "0":
-        raise SettingError(f"probes={spec!r}", _GRAMMAR, f"designs: {', '.join(DIRECTIONS)}")
+        number = re.fullmatch(r"[-+.\d]+", design) is not None
+        advice = _EXAMPLES if number else f"designs: {', '.join(DIRECTIONS)}"
+        raise SettingError(f"probes={spec!r}", _GRAMMAR, advice)
     if match[2] and match[1] in ("basis", "jacobian"):
         raise SettingError(
             f"probes={spec!r}: {match[1]} takes no count", _GRAMMAR, f'write "{match[1]}"'
