@@ -40,25 +40,25 @@ class Batches:
         self._actions = torch.from_numpy(demonstrations.actions).to(device)
         self._random, self._device = random, device
         self.gain = 1.0
-        self._pool: _Pool | None = None
+        self._dealer: _Dealer | None = None
         if probes is not None and answers is not None:
-            self._pool = _Pool(probes, answers, len(demonstrations), random("offset"), device)
+            self._dealer = _Dealer(probes, answers, len(demonstrations), random("offset"), device)
 
     def epoch(self, number: int, rows: Tensor, batches: int) -> Iterator[Minibatch]:
         """Deal out each of `rows` once, in `batches` minibatches of (almost) equal size."""
         order = torch.randperm(len(rows), generator=self._random(f"epoch {number}"))
-        if self._pool is not None:
-            self.gain = self._pool.load(number)
+        if self._dealer is not None:
+            self.gain = self._dealer.load(number)
         for part in rows[order].to(self._device).tensor_split(batches):
             yield self.visit(part, number)
 
     def visit(self, rows: Tensor, number: int) -> Minibatch:
         """Return the minibatch of some states at their visit of that number."""
-        around = self._pool.deal(rows, number) if self._pool is not None else (None, None)
+        around = self._dealer.deal(rows, number) if self._dealer is not None else (None, None)
         return Minibatch(self._observations[rows], self._actions[rows], *around)
 
 
-class _Pool:
+class _Dealer:
     """The expert's answers around each state; a visit of the state uses the next of them."""
 
     def __init__(

@@ -63,13 +63,8 @@ def _remembering(arguments: dict[str, Any]) -> Iterator[None]:
         return
     if is_written(folder):
         print(f"{folder} holds a finished run, which this one replaces", file=sys.stderr)
-    path, plain = (
-        folder / COMMAND,
-        {
-            name: str(value) if isinstance(value, Path) else value
-            for name, value in arguments.items()
-        },
-    )
+    plain = {k: str(v) if isinstance(v, Path) else v for k, v in arguments.items()}
+    path = folder / COMMAND
     with locked(folder):  # another run's arguments stay its own
         before = path.read_bytes() if path.exists() else None
         write_bytes(path, to_json(plain))

@@ -1,11 +1,13 @@
 """distill(): the whole story, from an expert and an environment to a student."""
 
 import time
+from collections import Counter
 from pathlib import Path
 
 import numpy as np
 import torch
 
+from fdtasil.account import Account
 from fdtasil.compute import pick_device, torch_settings
 from fdtasil.configuration import GATE_STATES, Configuration, check_count
 from fdtasil.datasets import DatasetLike, load_dataset
@@ -222,7 +224,9 @@ def distill(
         ):
             if folder and kept.finished and resume is not None:
                 return Distilled.load(folder, student_obs)
-            state = RunState(run, subject.expert, student_obs, kept, dataset=given, notes=notes)
+            asked = subject.expert.queries if subject.expert else Counter[str]()
+            account = Account(asked, notes)
+            state = RunState(run, subject.expert, student_obs, kept, account, dataset=given)
             callbacks = tell_all(callback, log_formats, folder)
             training = Training(state, place, Stages(progress), interrupts, callbacks)
             result = _go(training, subject, force=force)
@@ -307,9 +311,9 @@ def _go(training: Training, subject: Subject, *, force: bool) -> Distilled:
                 theirs = examine(expert, pool, starts, run.horizon, stages, force=force, rows=rows)
             else:
                 check_first(expert, pool, starts, force=force, rows=rows)
-        state.started = time.perf_counter()
+        state.account.started = time.perf_counter()
         Rounds(pool, training).all()
-        seconds, student, evaluation = state.seconds, state.trained, None
+        seconds, student, evaluation = state.account.seconds, state.trained, None
         if expert is not None and pool is not None and theirs is not None:
             policy = state.view.policy(student.act)
             evaluation = compare(policy, expert, theirs, pool, run.horizon, run.seed, stages)

@@ -2,7 +2,6 @@
 
 import platform
 import warnings
-from collections import Counter
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import replace
@@ -48,7 +47,7 @@ def report_of(
     predicted = replace(configuration, probes=source).predicted_queries() | {
         "calibrate": configuration.predicted_queries()["calibrate"]
     }
-    asked = state.expert.queries if state.expert else Counter[str]()
+    asked = state.account.queries
     return {
         "expert": {
             "path": configuration.expert,
@@ -72,7 +71,7 @@ def report_of(
         "steps": state.steps,
         "train_seconds": round(train_seconds, 2),
         "matmul_precision": matmul_precision,
-        "warnings": state.notes,
+        "warnings": state.account.notes,
     }
 
 

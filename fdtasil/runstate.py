@@ -2,7 +2,6 @@
 
 import io
 import json
-import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -10,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from fdtasil.account import Account
 from fdtasil.answers import Answers, Asking, ask_probes
 from fdtasil.calibration import Calibration, calibrate
 from fdtasil.configuration import Configuration
@@ -37,6 +37,7 @@ class RunState:
         expert: Who labels and answers probes; None where nothing has to be asked.
         student_obs: What the student sees; None for everything.
         folder: Where every stage is kept.
+        account: What it has cost so far.
         dataset: All labelled states so far and the answers around them.
         student: The last round's.
         history: Entries of all rounds.
@@ -46,27 +47,19 @@ class RunState:
         calibration: What was found about the expert in the first round, or None.
         source: The derivative source, with what the calibration found filled in; kept, for filling
             it in warns of a radius that misleads.
-        notes: The library's warnings so far; grows by itself.
-        earlier: Seconds that the interrupted run took for what is taken up from it.
-        started: When this process began, on the clock of `time.perf_counter`.
-        again: Rows asked before a checkpoint was taken up, which the interrupted run has asked
-            and counted too; None in a run that was not interrupted.
     """
 
     run: Configuration
     expert: Expert | None
     student_obs: StudentObservation | None
     folder: RunFolder
+    account: Account
     dataset: Dataset | None = None
     student: Student | None = None
     history: list[dict[str, float]] = field(default_factory=list)
     steps: int = 0
     episodes: int = 0
     counts: Counter[str] = field(default_factory=Counter)
-    notes: list[str] = field(default_factory=list)
-    earlier: float = 0.0
-    started: float = field(default_factory=time.perf_counter)
-    again: int | None = None
     calibration: Calibration | None = None
     source: Probes | None = field(init=False)
 
@@ -137,7 +130,7 @@ class RunState:
         def told(values: np.ndarray, states: int) -> None:
             move(states)
             if self.folder.due:
-                about = {"calibration": self._calibration_json(), **self.so_far()}
+                about = {"calibration": self._calibration_json(), **self.account.to_json()}
                 self.folder.save(
                     round_,
                     "asked",
@@ -154,7 +147,7 @@ class RunState:
             return None
         state: dict[str, Any] = json.loads(files["state.json"])
         self._restore_calibration(state["calibration"])
-        self.take_up(state)
+        self.account.take_up(state)
         return np.load(io.BytesIO(files["values.npy"]), allow_pickle=False)
 
     def _calibration_json(self) -> dict[str, Any] | None:
@@ -184,55 +177,14 @@ class RunState:
         if asking is not None and asking.known is not None:
             known = len(asking.known)
         moving = int(scales.probed(probes.space).sum())
-        self._check_budget(probes.queries(len(observations) - known, moving, 1))
+        due = probes.queries(len(observations) - known, moving, 1)
+        self.account.check_budget(due, self.run.max_queries)
         random, order = generator(self.run.seed, "probes", *path), self.run.order
         return ask_probes(expert, observations, probes, scales, random, order, asking)
 
-    def _check_budget(self, rows: int) -> None:
-        """Refuse to ask beyond the budget: early ends make a resampling source ask more often."""
-        # What a resumed run had to ask again is no part of what the run needs.
-        asked = sum(rows for purpose, rows in self.ledger().items() if purpose != "again")
-        most = self.run.max_queries
-        if most is not None and asked + rows > most:
-            raise SettingError(
-                f"{asked:,} rows are asked, and {rows:,} more are due",
-                f"at most max_queries={most:,}",
-                "raise max_queries, or leave out resample",
-            )
-
-    @property
-    def seconds(self) -> float:
-        """Wall-clock seconds of collecting, probing and training so far."""
-        return self.earlier + time.perf_counter() - self.started
-
-    def so_far(self) -> dict[str, Any]:
-        """Return what every checkpoint keeps of the account: rows, warnings and seconds."""
-        return {"queries": self.ledger(), "notes": list(self.notes), "seconds": self.seconds}
-
-    def take_up(self, account: dict[str, Any]) -> None:
-        """Take up the account of the interrupted run."""
-        self.restore_ledger(account["queries"])
-        kept = account["notes"]
-        self.notes[:] = kept + [note for note in self.notes if note not in kept]
-        self.earlier, self.started = account["seconds"], time.perf_counter()
-
-    def ledger(self) -> dict[str, int]:
-        """Return the rows that the expert has answered so far, by purpose."""
-        return dict(self.expert.queries) if self.expert else {}
-
-    def restore_ledger(self, queries: dict[str, int]) -> None:
-        """Take the ledger of the interrupted run; what this one asked before counts as again."""
-        if self.expert is None:
-            return
-        if self.again is None:
-            self.again = sum(self.expert.queries.values())
-        self.expert.queries.clear()
-        self.expert.queries.update(queries)
-        self.expert.queries["again"] += self.again
-
     def keep_recorded(self, round_: int, new: Dataset) -> None:
         """Keep what a round has recorded, before its probes are asked."""
-        about = {"episodes": self.episodes, "counts": self.counts, **self.so_far()}
+        about = {"episodes": self.episodes, "counts": self.counts, **self.account.to_json()}
         self.folder.save(
             round_,
             "recorded",
@@ -247,7 +199,7 @@ class RunState:
             return None
         state: dict[str, Any] = json.loads(files["state.json"])
         self.episodes, self.counts = state["episodes"], Counter(state["counts"])
-        self.take_up(state)
+        self.account.take_up(state)
         return Dataset.from_bytes(files["demonstrations.npz"])
 
     def keep_collected(self, round_: int) -> None:
@@ -256,7 +208,7 @@ class RunState:
             "episodes": self.episodes,
             "counts": self.counts,
             "calibration": self._calibration_json(),
-            **self.so_far(),
+            **self.account.to_json(),
         }
         self.folder.save(
             round_,
@@ -273,13 +225,13 @@ class RunState:
         state: dict[str, Any] = json.loads(files["state.json"])
         self.dataset = Dataset.from_bytes(files["demonstrations.npz"])
         self.episodes, self.counts = state["episodes"], Counter(state["counts"])
-        self.take_up(state)
+        self.account.take_up(state)
         self._restore_calibration(state["calibration"])
         return True
 
     def keep_trained(self, round_: int) -> None:
         """Keep a round's student."""
-        about = {"history": self.history, "steps": self.steps, **self.so_far()}
+        about = {"history": self.history, "steps": self.steps, **self.account.to_json()}
         self.folder.save(
             round_,
             "trained",
@@ -295,7 +247,7 @@ class RunState:
         state: dict[str, Any] = json.loads(files["state.json"])
         self.student = Student.from_bytes(files["student.safetensors"])
         self.history, self.steps = state["history"], state["steps"]
-        self.take_up(state)
+        self.account.take_up(state)
         return True
 
 

@@ -2,7 +2,6 @@
 
 import json
 import warnings
-from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 
@@ -51,7 +50,7 @@ class Training:
         seen = view.demonstrations(state.data.demonstrations)
         self._warn_of_one_episode(seen)
         resume, asked_pool = self._resumed(round_)
-        pools = _Asking(state, view, round_, asked_pool)
+        pools = _Pools(state, view, round_, asked_pool)
 
         def random(name: str) -> torch.Generator:
             return torch_generator(run.seed, "batches", round_, name)
@@ -99,7 +98,7 @@ class Training:
         if saved is None:
             return None, -1
         about = json.loads(saved["state.json"])
-        self.state.take_up(about)
+        self.state.account.take_up(about)
         return saved["fit.safetensors"], about["pool"]
 
     def _tell(
@@ -115,11 +114,11 @@ class Training:
 
         return tell
 
-    def _checkpoint(self, round_: int, pools: "_Asking") -> Callable[[FitState], None]:
+    def _checkpoint(self, round_: int, pools: "_Pools") -> Callable[[FitState], None]:
         def checkpoint(fitted: FitState) -> None:
             if not self.state.folder.due and not self.interrupts.due:
                 return
-            about = {"pool": pools.number, **self.state.so_far()}
+            about = {"pool": pools.number, **self.state.account.to_json()}
             self.state.folder.save(
                 round_,
                 "training",
@@ -131,7 +130,7 @@ class Training:
         return checkpoint
 
 
-class _Asking:
+class _Pools:
     """The expert's answers by number of the pool: those stored, then those of new directions."""
 
     def __init__(self, state: RunState, view: View, round_: int, asked: int) -> None:
@@ -153,7 +152,7 @@ class _Asking:
         return self._view.answers(answers, observations, probes.stencil.offsets)
 
     def _ask(self, observations: np.ndarray, number: int) -> Answers:
-        queries = self._state.expert.queries if self._state.expert else Counter[str]()
+        queries = self._state.account.queries
         before = queries["probe"]
         answers = self._state.ask(observations, self._round, number)
         if number == self._asked_before:  # the interrupted run has asked and counted these

@@ -21,6 +21,7 @@ ORDER = [
     "rounds",
     "training",
     "runstate",
+    "account",
     "runfolder",
     "lock",
     "interrupts",
