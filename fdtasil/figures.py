@@ -60,9 +60,11 @@ def draw_returns(evaluation: Evaluation) -> bytes:
     panel.xaxis.set_major_locator(MaxNLocator(integer=True))
     panel.set_xlabel("evaluation episode, in the order of the expert's return")
     panel.set_ylabel(f"return over {evaluation.horizon} steps")
-    panel.set_ylim(bottom=min(0.0, *expert, *student))
+    if min(*expert, *student) > 0:
+        panel.set_ylim(bottom=0)
     panel.grid(alpha=0.3, axis="y", linewidth=0.5)
-    panel.legend(frameon=False, fontsize=8, loc="lower left", ncols=2)
+    # Outside: between the axes its marks would read as two episodes.
+    panel.legend(frameon=False, fontsize=8, loc="upper left", bbox_to_anchor=(1, 1))
     return png_of(figure)
 
 

@@ -103,3 +103,39 @@ def test_an_error_is_short_and_says_the_next_step(arguments, code, found, tmp_pa
     if code == 1:
         assert len(failed.stderr.strip().splitlines()) <= 6
         assert "next step" in failed.stderr
+
+
+def test_a_run_goes_on_as_it_was_begun_and_a_failed_call_changes_nothing(tmp_path):
+    expert = mlp_onnx(tmp_path / "e.onnx")
+    failed = shell("distill", tmp_path / "none.onnx", TOY, *QUICK, "--out", tmp_path / "run")
+    assert failed.returncode == 1
+    assert not (tmp_path / "run").exists()
+    assert shell("distill", expert, TOY, *QUICK, "--out", tmp_path / "run").returncode == 0
+    before = (tmp_path / "run/command.json").read_bytes()
+    shell("distill", tmp_path / "none.onnx", TOY, *QUICK, "--out", tmp_path / "run")
+    assert (tmp_path / "run/command.json").read_bytes() == before
+    other = shell("distill", "--resume", tmp_path / "run", "--seed", "7")
+    assert other.returncode == 2
+    assert "--seed beside --resume" in other.stderr
+    replacing = shell("distill", expert, TOY, *QUICK, "--seed", 1, "--out", tmp_path / "run")
+    assert "which this one replaces" in replacing.stderr
+
+
+def test_a_module_of_the_current_folder_and_a_warning_without_source(tmp_path):
+    """As the installed command, which does not look into the current folder by itself."""
+    expert = mlp_onnx(tmp_path / "e.onnx")
+    (tmp_path / "mine.py").write_text(
+        "import gymnasium, toy_environments as toys\n"
+        "gymnasium.register('My-v0', entry_point=toys.Integrator, max_episode_steps=15)\n"
+    )
+    start = "import sys; sys.path.remove(''); from fdtasil.cli import main; main()"
+    command = [sys.executable, "-c", start, "distill", str(expert), "mine:My-v0", *QUICK]
+    environment = {**os.environ, "PYTHONPATH": os.path.dirname(__file__)}
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=environment)
+    assert done.returncode == 0, done.stderr
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("fdtasil: warning: horizon=20")
+
+
+def test_the_version_is_told():
+    assert shell("--version").stdout == f"fdtasil {fdtasil.__version__}\n"

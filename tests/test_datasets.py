@@ -185,3 +185,20 @@ def test_a_twin_is_probed_too(tmp_path):
     expert = mlp_onnx(tmp_path / "e.onnx")
     result = fdtasil.distill(expert, TOY, "jacobian", student_obs=[0, 1], **QUICK)
     assert result.answers.values.shape[1] == 2
+
+
+def test_a_folder_with_another_runs_demonstrations_is_refused(linear, tmp_path):
+    for seed in (0, 1):
+        fdtasil.distill(linear, TOY, 0, seed=seed, out=tmp_path / str(seed), **QUICK)
+    other = (tmp_path / "1/demonstrations.npz").read_bytes()
+    (tmp_path / "0/demonstrations.npz").write_bytes(other)
+    with pytest.raises(StorageError, match=r"demonstrations\.npz changed after writing"):
+        fdtasil.distill(demonstrations=tmp_path / "0", steps=5, hidden=4)
+    alone = tmp_path / "0/demonstrations.npz"
+    fdtasil.distill(demonstrations=alone, probes=0, steps=5, hidden=4)
+
+
+def test_a_result_shows_itself_in_a_few_lines(linear):
+    shown = repr(fdtasil.distill(linear, TOY, 2, **QUICK))
+    assert "40 states, probes adaptive:2" in shown
+    assert len(shown.splitlines()) < 10

@@ -633,3 +633,24 @@ def test_the_seeds_of_runs_streams_and_episodes_do_not_overlap(linear):
         for seed in (0, 1)
     )
     assert not {row.tobytes() for row in first} & {row.tobytes() for row in second}
+
+
+def test_every_time_limit_counts_and_none_is_passed_over(linear):
+    """Of a wrapper around an environment that was never registered, too."""
+
+    def short():
+        return gymnasium.wrappers.TimeLimit(Integrator(), 7)
+
+    result = fdtasil.distill(linear, short, 0, **{**QUICK, "horizon": None})
+    assert len(result.demonstrations) == 7 * QUICK["episodes"]
+    with pytest.warns(FdtasilWarning, match="ends its episodes at 7 steps"):
+        result = fdtasil.distill(linear, short, 0, **{**QUICK, "horizon": 9})
+    assert result.evaluation.horizon == 7
+
+
+def test_starts_that_differ_with_one_seed_are_warned_of():
+    def remembering():
+        return gymnasium.wrappers.NormalizeObservation(Integrator())
+
+    with pytest.warns(FdtasilWarning, match="same observation twice with one seed"):
+        fdtasil.distill(lambda x: 0.1 * np.tanh(x[:, :2]), remembering, 0, **QUICK)
