@@ -230,11 +230,17 @@ def _key(cell: Cell) -> str:
 
 
 def _machine() -> str:
-    model = platform.processor() or platform.machine()
-    cpuinfo = Path("/proc/cpuinfo")
+    """Return what bytes depend on: one name of a processor stands for several generations."""
+    model, cpuinfo = platform.processor() or platform.machine(), Path("/proc/cpuinfo")
     if cpuinfo.exists():
-        names = [line for line in cpuinfo.read_text().splitlines() if "model name" in line]
-        model = names[0].partition(":")[2].strip() if names else model
+        lines = cpuinfo.read_text().splitlines()
+        said = {
+            key.strip(): value.strip() for key, _, value in (line.partition(":") for line in lines)
+        }
+        model = said.get("model name", model)
+        if "cpu family" in said:
+            vectors = "AVX-512" if "avx512f" in said["flags"] else "no AVX-512"
+            model += f" (family {said['cpu family']}, model {said['model']}, {vectors})"
     return f"{model}, {os.cpu_count()} cores"
 
 
