@@ -5,25 +5,18 @@ from typing import Any
 
 from benchmarks.comparison import draw_methods, scores_of
 from benchmarks.distillation import STEPS, distillations, usual_arguments
-from benchmarks.finite_difference import SEEDS, STANDARD_METHODS, experts, label
+from benchmarks.finite_difference import SEEDS, experts
 from benchmarks.runner import Cell, Row
 
 __all__ = ["TRAINING_LENGTH"]
 
 BUDGETS = (5, 20)
-LENGTHS = (STEPS, 2 * STEPS, 4 * STEPS)
-SOURCES = ("10", "plain")
+LENGTHS = (STEPS, 2 * STEPS)
 METHODS: dict[str, dict[str, Any]] = {
-    f"{label(source)}, {steps:,} steps": {**STANDARD_METHODS[source], "steps": steps}
-    for source in SOURCES
-    for steps in LENGTHS
+    f"10 probes, {steps:,} steps": {"probes": 10, "steps": steps} for steps in LENGTHS
 }
-# What longer training adds, with probes and without.
-PAIRS = tuple(
-    tuple(f"{label(source)}, {steps:,} steps" for steps in (longer, STEPS))
-    for source in SOURCES
-    for longer in LENGTHS[1:]
-)
+SHORT, LONG = METHODS
+PAIRS = ((LONG, SHORT),)
 
 
 def cells(quick: bool) -> list[Cell]:
