@@ -32,7 +32,8 @@ KEPT = (
 )
 HEAD = f"""\
 Shares of the undisturbed expert's return, {EPISODES} trajectories of {HORIZON} steps, \
-{len(SEEDS)} seeds, {EVALUATED} episodes under each disturbance. Noise is in standard deviations of the demonstrations' observations; a push
+{len(SEEDS)} seeds, {EVALUATED} episodes under each disturbance. Noise is in standard deviations \
+of the demonstrations' observations; a push
 comes every {STEPS_BETWEEN_PUSHES} steps and gives the whole body the speed; mass takes inertia
 along. Humanoid observes its masses, so that they disturb its input too.
 """

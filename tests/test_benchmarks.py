@@ -338,3 +338,20 @@ def test_what_is_derived_from_masses_follows_them():
     masses, model = usual.unwrapped.model.body_mass, heavier.unwrapped.model
     np.testing.assert_allclose(model.body_mass, 1.2 * masses)
     np.testing.assert_allclose(model.body_subtreemass[1], model.body_mass.sum())
+
+
+def test_a_table_says_where_its_rows_were_made():
+    from benchmarks.runner import provenance
+
+    rows = [
+        {"machine": machine, "commit": commit, "result": {}}
+        for machine, commit in (("A", "1"), ("B", "2"), ("A", "3"), ("A", "1"))
+    ]
+    assert provenance(rows) == "Made on A (1, 3); B (2)."
+
+
+def test_no_mean_is_taken_of_what_is_no_number():
+    from benchmarks.statistics import interval_text
+
+    with pytest.raises(ValueError, match="no number"):
+        interval_text([0.5, None, 0.7])
