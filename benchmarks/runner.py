@@ -153,7 +153,7 @@ def results_of(rows: Iterable[Row]) -> list[Row]:
 
 def provenance(rows: Iterable[Row]) -> str:
     """Return, in a sentence, on which machines and at which commits rows were made."""
-    made = sorted({(row["machine"], row["commit"]) for row in rows})
+    made = sorted({(row["machine"], row["commit"] or "no commit") for row in rows})
     parts = (
         f"{machine} ({', '.join(commit for other, commit in made if other == machine)})"
         for machine in dict.fromkeys(machine for machine, _ in made)

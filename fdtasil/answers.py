@@ -16,7 +16,9 @@ __all__ = ["Answers", "Asking", "ask_moved", "ask_probes"]
 
 # States that a design is shown: enough to tell which displacements can occur.
 _SHOWN = 4096
-_ROWS = 2**15  # points made at once: 44 MiB each of Humanoid's, and some copies
+# Points asked at once: as quick as more for an onnxruntime session, and of an expert that takes
+# 50 ms a row no more than a minute is lost.
+_ROWS = 2**10
 _MUCH = 2**30  # bytes of answers that are announced before they are asked
 _ROUNDED = 0.1  # share of a step that rounding may take before it is warned of
 

@@ -1,7 +1,6 @@
 """The same functions from a shell; every default and help text is read from them."""
 
 import json
-import os
 import sys
 import warnings
 from collections.abc import Callable, Iterator
@@ -27,6 +26,7 @@ from fdtasil.shell import (
     OptionalExpert,
     PolicyPath,
     as_command,
+    import_module_of,
 )
 from fdtasil.storage import is_written, to_json, write_bytes
 
@@ -34,17 +34,20 @@ __all__ = ["COMMANDS", "main"]
 
 COMMAND = "command.json"
 """File of a run's folder with the arguments that `fdtasil distill` was called with."""
+_BESIDE = ("resume", "max_queries")  # what may be said of a run that goes on
 
 
 def _distill(compare: bool, **arguments: Any) -> None:
     resume = arguments["resume"]
+    import_module_of(arguments["env"])
     if resume is None:
         with _remembering(arguments):
             result, out = distill(**arguments), arguments["out"]
     else:
         if arguments["expert"] is None and arguments["env"] is None:
             _check_alone(arguments)
-            arguments = {**_remembered(resume), "resume": resume}
+            mine = {name: arguments[name] for name in _BESIDE if arguments[name] is not None}
+            arguments = {**_remembered(resume), **mine}
         arguments["out"] = None  # a resumed run stays in its own folder
         result, out = distill(**arguments), resume
     plainly = {**arguments, "probes": 0, "out": None, "resume": None, "log_formats": ()}
@@ -91,7 +94,7 @@ def _check_alone(arguments: dict[str, Any]) -> None:
     given = [
         f"--{name.replace('_', '-')}"
         for name, value in arguments.items()
-        if name != "resume" and value != usual[name]
+        if name not in _BESIDE and value != usual[name]
     ]
     if given:
         raise SettingError(
@@ -137,6 +140,7 @@ def _export_sb3(**arguments: Any) -> None:
 
 
 def _evaluate(**arguments: Any) -> None:
+    import_module_of(arguments["env"])
     print(evaluate(**arguments))
 
 
@@ -204,7 +208,6 @@ def main() -> None:
     if sys.argv[1:] == ["--version"]:
         print(f"fdtasil {version('fdtasil')}")
         return
-    sys.path.append(os.getcwd())  # `module:Id` may lie where the user is, as with `python -m`
     with warnings.catch_warnings():
         warnings.showwarning = _plainly(warnings.showwarning)
         _run()

@@ -110,7 +110,9 @@ def load_dataset(source: DatasetLike) -> Dataset:
     try:
         whole = path.is_dir() and is_written(path)
         return _checked(
-            Dataset.from_bytes(verify(path)[file.name] if whole else file.read_bytes())
+            Dataset.from_bytes(
+                verify(path, [file.name])[file.name] if whole else file.read_bytes()
+            )
         )
     except OSError as error:
         if isinstance(error, StorageError):

@@ -14,7 +14,7 @@ from fdtasil.presets import PRESETS
 from fdtasil.rollouts import rollout
 from fdtasil.scales import statistics
 from fdtasil.seeding import episode_seeds, generator
-from fdtasil.shell import EnvironmentId, ExpertPath
+from fdtasil.shell import EnvironmentId, ExpertPath, import_module_of
 from fdtasil.storage import write_bytes
 
 __all__ = ["inspect_expert"]
@@ -46,6 +46,7 @@ def inspect_expert(
         picture: PNG file to draw the ladder of radii into.
     """
     check_count("episodes", episodes)
+    import_module_of(env)
     with EnvironmentPool(env) as pool:
         boxes, length = pool.boxes, resolve_horizon(horizon, pool)
         opened = load_expert(expert, boxes.observation_size, boxes.action_size, output=output)

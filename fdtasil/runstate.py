@@ -126,6 +126,7 @@ class RunState:
         """
         known = self._restore_asked(round_)
         self.calibrate()
+        self.check_budget(len(observations) - (0 if known is None else len(known)))
 
         def told(values: np.ndarray, states: int) -> None:
             move(states)
@@ -158,11 +159,22 @@ class RunState:
             self.calibration = Calibration.from_json(kept)
             self.source = self.calibration.complete(self.run.probes)
 
+    def check_budget(self, states: int) -> None:
+        """Refuse to ask the probes of some states where the budget does not allow it.
+
+        Raises:
+            SettingError: If it does not.
+        """
+        if self.source is not None and self.expert is not None:
+            moving = int(self.scales.probed(self.source.space).sum())
+            due = self.source.queries(states, moving, 1)
+            self.account.check_budget(due, self.run.max_queries)
+
     def ask(self, observations: np.ndarray, *path: int, asking: Asking | None = None) -> Answers:
         """Ask the probes around states, along the directions of a named stream.
 
         Raises:
-            SettingError: If there is nobody to ask, or the budget does not allow it.
+            SettingError: If there is nobody to ask.
             ExpertError: As `ask_probes`.
         """
         probes, expert = self.source, self.expert
@@ -173,12 +185,7 @@ class RunState:
                 "an expert, or demonstrations with stored answers",
                 "pass the expert, or probes=0 for plain behaviour cloning",
             )
-        scales, known = self.scales, 0
-        if asking is not None and asking.known is not None:
-            known = len(asking.known)
-        moving = int(scales.probed(probes.space).sum())
-        due = probes.queries(len(observations) - known, moving, 1)
-        self.account.check_budget(due, self.run.max_queries)
+        scales = self.scales
         random, order = generator(self.run.seed, "probes", *path), self.run.order
         return ask_probes(expert, observations, probes, scales, random, order, asking)
 
@@ -225,8 +232,8 @@ class RunState:
         state: dict[str, Any] = json.loads(files["state.json"])
         self.dataset = Dataset.from_bytes(files["demonstrations.npz"])
         self.episodes, self.counts = state["episodes"], Counter(state["counts"])
-        self.account.take_up(state)
         self._restore_calibration(state["calibration"])
+        self.account.take_up(state)
         return True
 
     def keep_trained(self, round_: int) -> None:

@@ -1,7 +1,11 @@
 """A function of the library as a command: its signature and docstring, as a shell can say them."""
 
+import importlib
 import inspect
+import os
+import sys
 from collections.abc import Callable
+from contextlib import suppress
 from types import NoneType, UnionType
 from typing import Annotated, Any, Union, get_args, get_origin
 
@@ -15,6 +19,7 @@ __all__ = [
     "OptionalExpert",
     "PolicyPath",
     "as_command",
+    "import_module_of",
 ]
 
 OptionalExpert = Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="EXPERT")]
@@ -80,3 +85,20 @@ def _shell_parameter(
         metavar = _METAVARS.get(get_origin(inner) or inner, "TEXT")
         kind = Annotated[kind, tyro.conf.arg(metavar=metavar)]
     return parameter.replace(annotation=kind, default=default, kind=inspect.Parameter.KEYWORD_ONLY)
+
+
+def import_module_of(environment: str | None) -> None:
+    """Import the module of "module:Id" where it lies in the current folder.
+
+    Nothing else is looked for there: a folder that somebody else filled runs no code by itself.
+    """
+    module, named, _ = (environment or "").partition(":")
+    here = os.getcwd()
+    if not named or here in sys.path:
+        return
+    sys.path.append(here)
+    try:
+        with suppress(ImportError):  # gymnasium says what is missing
+            importlib.import_module(module)
+    finally:
+        sys.path.remove(here)

@@ -12,7 +12,7 @@ import json
 import os
 import secrets
 import shutil
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from pathlib import Path, PurePosixPath
 from typing import Any
 
@@ -68,7 +68,7 @@ def write_folder(folder: Path, files: Mapping[str, bytes]) -> None:
     """
     coming = folder / _COMING
     _move_in(folder)
-    old = _listed(folder)
+    old = _written_by_us(folder)
     try:
         if coming.exists():
             shutil.rmtree(coming)
@@ -82,20 +82,24 @@ def write_folder(folder: Path, files: Mapping[str, bytes]) -> None:
     write_bytes(coming / MANIFEST, to_json(manifest))
     _move_in(folder)
     for name in old - files.keys():
-        (folder / name).unlink(missing_ok=True)
+        with contextlib.suppress(OSError):  # what is new is whole, and that is what counts
+            (folder / name).unlink()
 
 
-def _listed(folder: Path) -> set[str]:
-    """Return what a folder's manifest lists; nothing where it can't be trusted to say."""
+def _written_by_us(folder: Path) -> set[str]:
+    """Return the files that an earlier call wrote and nobody has changed; none if in doubt."""
     try:
-        names = json.loads((folder / MANIFEST).read_bytes())
-    except (OSError, ValueError):
+        return set(verify(folder))
+    except StorageError:
         return set()
-    return {name for name in names if stays_inside(name)} if isinstance(names, dict) else set()
 
 
-def verify(folder: Path) -> dict[str, bytes]:
+def verify(folder: Path, names: Collection[str] | None = None) -> dict[str, bytes]:
     """Read the files of a folder that `write_folder` made, checking each against the manifest.
+
+    Args:
+        folder: Where.
+        names: Which files; None for all of them.
 
     Returns:
         Content by name.
@@ -111,7 +115,10 @@ def verify(folder: Path) -> dict[str, bytes]:
             raise ValueError(f"{MANIFEST} changed after writing")
         if not all(map(stays_inside, manifest)):
             raise ValueError(f"{MANIFEST} names a file outside of the folder")
-        files = {name: _place(folder, name).read_bytes() for name in manifest}
+        wanted = manifest if names is None else names
+        if missing := set(wanted) - manifest.keys():
+            raise ValueError(f"{MANIFEST} does not name {', '.join(sorted(missing))}")
+        files = {name: _place(folder, name).read_bytes() for name in wanted}
     except (OSError, ValueError) as error:
         raise StorageError(
             f"{folder}: {error}", "a folder written by save()", "check the path, or save again"

@@ -154,6 +154,8 @@ class _Pools:
     def _ask(self, observations: np.ndarray, number: int) -> Answers:
         queries = self._state.account.queries
         before = queries["probe"]
+        if number != self._asked_before:  # those are in the account already
+            self._state.check_budget(len(observations))
         answers = self._state.ask(observations, self._round, number)
         if number == self._asked_before:  # the interrupted run has asked and counted these
             queries["again"] += queries["probe"] - before

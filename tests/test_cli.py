@@ -139,3 +139,16 @@ def test_a_module_of_the_current_folder_and_a_warning_without_source(tmp_path):
 
 def test_the_version_is_told():
     assert shell("--version").stdout == f"fdtasil {fdtasil.__version__}\n"
+
+
+def test_no_other_file_of_the_current_folder_is_run(tmp_path):
+    """Optional modules that dependencies look for may lie in a folder that was downloaded."""
+    expert = mlp_onnx(tmp_path / "e.onnx")
+    for name in ("glfw_preview", "cffi", "tensorboard"):
+        (tmp_path / f"{name}.py").write_text("print('CODE OF THE FOLDER')")
+    start = "import sys; sys.path.remove(''); from fdtasil.cli import main; main()"
+    command = [sys.executable, "-c", start, "inspect", str(expert), TOY, "--episodes", "1"]
+    environment = {**os.environ, "PYTHONPATH": os.path.dirname(__file__)}
+    done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=environment)
+    assert done.returncode == 0, done.stderr
+    assert "CODE OF THE FOLDER" not in done.stdout + done.stderr

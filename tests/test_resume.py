@@ -128,9 +128,10 @@ def test_a_broken_checkpoint_is_named_and_an_earlier_one_used(expert, golden, tm
     assert read(folder) == expected
 
 
-def test_a_run_that_asked_all_it_may_is_resumed(expert, tmp_path):
+@pytest.mark.parametrize("probes", ["sphere:2,forward", "sphere:12,forward,resample"])
+def test_a_run_that_asked_all_it_may_is_resumed(probes, expert, tmp_path):
     """What was asked again is no part of the budget, and the budget may be another."""
-    run = {**RUN, "probes": "sphere:2,forward"}
+    run = {**RUN, "trainer": "bc", "probes": probes}
     whole = fdtasil.distill(expert, TOY, **run).report["predicted_queries"]
     budget = sum(whole.values())
     for name, later in (("same", budget), ("higher", 2 * budget)):

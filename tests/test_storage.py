@@ -120,3 +120,19 @@ def test_files_that_are_no_more_written_go(tmp_path):
     assert verify(tmp_path) == {"kept": b"3"}
     assert not (tmp_path / "figures/old.png").exists()
     assert (tmp_path / "notes.txt").exists()
+
+
+def test_a_manifest_of_somebody_else_removes_nothing(tmp_path):
+    (tmp_path / "manifest.json").write_text('{"train.csv": "abc", "icons": []}')
+    (tmp_path / "train.csv").write_text("1, 2")
+    (tmp_path / "icons").mkdir()
+    write_folder(tmp_path, {"kept": b"1"})
+    assert (tmp_path / "train.csv").exists()
+    assert verify(tmp_path) == {"kept": b"1"}
+
+
+def test_a_file_that_was_changed_is_not_removed(tmp_path):
+    write_folder(tmp_path, {"a": b"1", "b": b"2"})
+    (tmp_path / "b").write_text("the user's own by now")
+    write_folder(tmp_path, {"a": b"3"})
+    assert (tmp_path / "b").exists()
