@@ -41,7 +41,8 @@ def draw_panels(
 
     Args:
         experts: The curves of each expert; the same methods in the same order.
-        across: What the places are; empty where the ticks say it, which then stand upright.
+        across: What the places are; empty where the ticks say it, which then stand upright, and
+            nothing lies between two of them.
         score: What is drawn upwards.
         ticks: What the places 0, 1, 2, ... are called; None for places that are numbers, on a
             logarithmic axis.
@@ -56,7 +57,7 @@ def draw_panels(
     for panel, (expert, curves) in zip(panels, experts.items(), strict=True):
         panel.axhline(1, color="0.8", linewidth=0.8, zorder=0)
         for number, (name, values) in enumerate(curves.items()):
-            _draw_curve(panel, values, number, name)
+            _draw_curve(panel, values, number, name, joined=bool(across))
         panel.set_title(expert, fontsize=10)
         if ticks is None:
             panel.set_xscale("log")
@@ -74,7 +75,12 @@ def draw_panels(
 
 
 def _draw_curve(
-    panel: "Axes", values: Mapping[float, Sequence[float]], number: int, name: str
+    panel: "Axes",
+    values: Mapping[float, Sequence[float]],
+    number: int,
+    name: str,
+    *,
+    joined: bool,
 ) -> None:
     means = np.array([interquartile_mean(sample) for sample in values.values()])
     low, high = np.transpose([interval(sample) for sample in values.values()])
@@ -86,7 +92,7 @@ def _draw_curve(
         marker=marker,
         markersize=4.5,
         markerfacecolor="white" if number % 2 else grey,
-        linestyle=line,
+        linestyle=line if joined else "none",
         linewidth=0.9,
         elinewidth=0.8,
         color=grey,

@@ -31,11 +31,11 @@ KEPT = (
     "physics_resets",
 )
 HEAD = f"""\
-Shares of the undisturbed expert's return, {EPISODES} trajectories of {HORIZON} steps, \
-{len(SEEDS)} seeds, {EVALUATED} episodes under each disturbance. Noise is in standard deviations \
-of the demonstrations' observations; a push
-comes every {STEPS_BETWEEN_PUSHES} steps and gives the whole body the speed; mass takes inertia
-along. Humanoid observes its masses, so that they disturb its input too.
+Shares of the undisturbed expert's return, {EPISODES} trajectories of {HORIZON} steps,
+{len(SEEDS)} seeds, {EVALUATED} episodes under each disturbance. Noise is in standard deviations of
+the demonstrations' observations; a push comes every {STEPS_BETWEEN_PUSHES} steps and gives the
+whole body the speed; mass takes inertia along. Humanoid observes its masses, so that they disturb
+its input too.
 """
 
 
@@ -124,7 +124,7 @@ def draw(rows: Sequence[Row]) -> dict[str, bytes]:
         COLUMNS,
         label,
         across="",
-        score="return, share of the undisturbed expert's",
+        score="share of the undisturbed return",
     )
     return {"robustness.png": picture, "robustness.md": text.encode()}
 
