@@ -46,7 +46,7 @@ def open_run_folder(
         yield folder
         return
     before = _read_config(path) if resume else None
-    going_on = f'go on with the same arguments and resume="{path}" (--resume {path})'
+    going_on = f'go on with resume="{path}" (--resume {path})'
     with locked(path):
         if before is not None:
             _check_same(before, config, path)
