@@ -71,10 +71,16 @@ def differences_table(
     return table(["expert", across, *(f"{ours} - {theirs}" for ours, theirs in pairs)], rows)
 
 
-def scores_text(scores: Scores, methods: Sequence[str], pairs: Sequence[tuple[str, str]]) -> str:
+def scores_text(
+    scores: Scores,
+    methods: Sequence[str],
+    pairs: Sequence[tuple[str, str]],
+    across: str = TRAJECTORIES,
+) -> str:
     """Return the table of the methods, and that of the pairs' differences."""
-    differences = differences_table(scores, pairs)
-    return f"{scores_table(scores, methods)}\nDifferences on equal seeds:\n\n{differences}"
+    differences = differences_table(scores, pairs, across)
+    table_of_scores = scores_table(scores, methods, across)
+    return f"{table_of_scores}\nDifferences on equal seeds:\n\n{differences}"
 
 
 def draw_methods(

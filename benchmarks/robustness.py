@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 
 import fdtasil
-from benchmarks.comparison import Column, Scores, differences_table, draw_scores, scores_table
+from benchmarks.comparison import Column, Scores, draw_scores, scores_text
 from benchmarks.controllers import CONTROLLERS
 from benchmarks.distillation import HORIZON
 from benchmarks.disturbances import DISTURBANCES, STEPS_BETWEEN_PUSHES, Disturbance
@@ -114,8 +114,7 @@ def draw(rows: Sequence[Row]) -> dict[str, bytes]:
         if (expert, name) not in scores
     ]
     text = (
-        f"{HEAD}\n{scores_table(scores, COLUMNS, 'disturbance')}\n"
-        f"Differences on equal seeds:\n\n{differences_table(scores, PAIRS, 'disturbance')}\n"
+        f"{HEAD}\n{scores_text(scores, COLUMNS, PAIRS, 'disturbance')}\n"
         "Left out, for the expert could not be followed or the simulator reset itself: "
         f"{', '.join(missing) or 'nothing'}.\n"
     )

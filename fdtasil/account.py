@@ -2,12 +2,18 @@
 
 import time
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any
 
 from fdtasil.errors import SettingError
 
-__all__ = ["Account"]
+__all__ = ["Account", "rows_text"]
+
+
+def rows_text(queries: Mapping[str, int]) -> str:
+    """Return rows by purpose as one line of text, without those that are none."""
+    return ", ".join(f"{purpose} {rows:,}" for purpose, rows in queries.items() if rows)
 
 
 @dataclass

@@ -12,7 +12,7 @@ from fdtasil.experts import Expert, Purpose
 from fdtasil.probes import Probes
 from fdtasil.scales import Statistics
 
-__all__ = ["Answers", "Asking", "ask_moved", "ask_probes"]
+__all__ = ["UNFOLLOWED", "Answers", "Asking", "ask_moved", "ask_probes"]
 
 # States that a design is shown: enough to tell which displacements can occur.
 _SHOWN = 4096
@@ -68,8 +68,11 @@ class Asking:
         told: Given the (S, k, p, m) answers so far and how many states of them are new.
     """
 
-    known: np.ndarray | None
-    told: Callable[[np.ndarray, int], None]
+    known: np.ndarray | None = None
+    told: Callable[[np.ndarray, int], None] = lambda values, states: None
+
+
+UNFOLLOWED = Asking()
 
 
 def ask_probes(
@@ -79,7 +82,7 @@ def ask_probes(
     scales: Statistics,
     random: np.random.Generator,
     order: int = 1,
-    asking: Asking | None = None,
+    asking: Asking = UNFOLLOWED,
 ) -> Answers:
     """Ask the expert around each state.
 
@@ -131,7 +134,7 @@ def _ask_probes(
     scales: Statistics,
     random: np.random.Generator,
     order: int,
-    asking: Asking | None,
+    asking: Asking,
 ) -> Answers:
     deviation = 1.0 if probes.space == "raw" else scales.deviation
     step_scale = np.where(scales.probed(probes.space), deviation, 0.0)
@@ -162,17 +165,17 @@ def _ask_values(
     displacements: np.ndarray,
     numbers: np.ndarray,
     offsets: Sequence[float],
-    asking: Asking | None,
+    asking: Asking,
 ) -> np.ndarray:
     """Ask for the values at the stencil's points, a bounded number of rows at a time."""
     states, count = numbers.shape
     block = max(1, _ROWS // (count * len(offsets)))
     shifts = np.asarray(offsets, np.float32)[:, None]
     values, done = None, 0
-    if asking is not None and asking.known is not None:
-        known, done = asking.known, len(asking.known)
-        values = np.empty((states, *known.shape[1:]), np.float32)
-        values[:done] = known
+    if asking.known is not None:
+        done = len(asking.known)
+        values = np.empty((states, *asking.known.shape[1:]), np.float32)
+        values[:done] = asking.known
         asking.told(values[:done], done)
     for start in range(done, states, block):
         rows = slice(start, start + block)
@@ -184,8 +187,7 @@ def _ask_values(
             values = np.empty((states, count, len(offsets), answers.shape[1]), np.float32)
             _announce(values)
         values[rows] = answers.reshape(*points.shape[:3], -1)
-        if asking is not None:
-            asking.told(values[: start + len(points)], len(points))
+        asking.told(values[: start + len(points)], len(points))
     assert values is not None, "there is no demonstration without a state"
     return values
 

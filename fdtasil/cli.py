@@ -12,6 +12,7 @@ from typing import Any
 
 import tyro
 
+from fdtasil.account import rows_text
 from fdtasil.distilled import Distilled
 from fdtasil.errors import FdtasilError, FdtasilWarning, SettingError
 from fdtasil.evaluation import interval_text, score_text
@@ -52,8 +53,7 @@ def _distill(compare: bool, **arguments: Any) -> None:
         result, out = distill(**arguments), resume
     plainly = {**arguments, "probes": 0, "out": None, "resume": None, "log_formats": ()}
     print(_side_by_side(result, distill(**plainly) if compare else None))
-    asked = ", ".join(f"{name} {rows:,}" for name, rows in result.queries.items() if rows)
-    print(f"rows asked of the expert: {asked}")
+    print(f"rows asked of the expert: {rows_text(result.queries)}")
     print(f"saved in {out}: student.onnx, student.safetensors, report.json, figures/, ...")
 
 

@@ -4,6 +4,7 @@ from dataclasses import asdict, dataclass
 from numbers import Integral
 from typing import Any
 
+from fdtasil.account import rows_text
 from fdtasil.calibration import Ladder, ladder_for
 from fdtasil.errors import SettingError
 from fdtasil.fit import Fit
@@ -103,9 +104,8 @@ class Configuration:
         total = sum(predicted.values())
         if self.max_queries is None or total <= self.max_queries:
             return
-        parts = ", ".join(f"{name} {rows:,}" for name, rows in predicted.items() if rows)
         raise SettingError(
-            f"this run may ask the expert {total:,} times ({parts})",
+            f"this run may ask the expert {total:,} times ({rows_text(predicted)})",
             f"at most max_queries={self.max_queries:,}",
             "lower probes, episodes, horizon or evaluation_episodes, or raise max_queries",
         )

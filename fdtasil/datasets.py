@@ -46,11 +46,6 @@ class Dataset:
         states = self.demonstrations
         return states.observations.shape[1], states.actions.shape[1]
 
-    @property
-    def episodes(self) -> int:
-        """How many episodes there are."""
-        return len(np.unique(self.demonstrations.episode))
-
     def to_bytes(self) -> bytes:
         """Return the dataset as an npz file.
 
@@ -108,12 +103,11 @@ def load_dataset(source: DatasetLike) -> Dataset:
     path = Path(source)
     file = path / "demonstrations.npz" if path.is_dir() else path
     try:
-        whole = path.is_dir() and is_written(path)
-        return _checked(
-            Dataset.from_bytes(
-                verify(path, [file.name])[file.name] if whole else file.read_bytes()
-            )
-        )
+        if path.is_dir() and is_written(path):
+            data = verify(path, [file.name])[file.name]
+        else:
+            data = file.read_bytes()
+        return _checked(Dataset.from_bytes(data))
     except OSError as error:
         if isinstance(error, StorageError):
             error.add_note(f"read from {file}")

@@ -36,6 +36,11 @@ class Demonstrations:
     def __len__(self) -> int:
         return len(self.observations)
 
+    @property
+    def episodes(self) -> int:
+        """How many episodes the states are of."""
+        return len(np.unique(self.episode))
+
     def __add__(self, other: "Demonstrations") -> "Demonstrations":
         pairs = zip(vars(self).values(), vars(other).values(), strict=True)
         return Demonstrations(*(np.concatenate(pair) for pair in pairs))

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from fdtasil.account import rows_text
 from fdtasil.answers import Answers
 from fdtasil.calibration import Calibration
 from fdtasil.datasets import Dataset
@@ -66,11 +67,10 @@ class Distilled:
 
     def __repr__(self) -> str:
         """Return what a notebook shows of it."""
-        asked = ", ".join(f"{name} {rows:,}" for name, rows in self.queries.items() if rows)
         lines = [
             f"{self.report['env']}: {len(self.demonstrations):,} states, probes "
             f"{self.report['probes']}, {self.report['steps']:,} steps",
-            f"asked of the expert: {asked or 'nothing'}",
+            f"asked of the expert: {rows_text(self.queries) or 'nothing'}",
             "trained without an evaluation" if self.evaluation is None else str(self.evaluation),
         ]
         return "\n".join(lines)

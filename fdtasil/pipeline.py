@@ -207,7 +207,7 @@ def distill(
             hidden=defaults.hidden if widths is None else tuple(map(int, widths)),
             activation=defaults.activation if activation is None else activation,
             fit=settings,
-            episodes=given.episodes if given else check_count("episodes", episodes),
+            episodes=given.demonstrations.episodes if given else check_count("episodes", episodes),
             horizon=resolve_horizon(horizon, subject.pool) if subject.pool else 0,
             seed=int(seed),
             device=device,

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from fdtasil.account import Account
-from fdtasil.answers import Answers, Asking, ask_probes
+from fdtasil.answers import UNFOLLOWED, Answers, Asking, ask_probes
 from fdtasil.calibration import Calibration, calibrate
 from fdtasil.configuration import Configuration
 from fdtasil.datasets import Dataset
@@ -26,6 +26,10 @@ from fdtasil.student import Student
 from fdtasil.views import StudentObservation, View
 
 __all__ = ["RunState"]
+
+# Files of a checkpoint.
+_STATE, _STATES, _STUDENT = "state.json", "demonstrations.npz", "student.safetensors"
+_VALUES = "values.npy"
 
 
 @dataclass
@@ -131,33 +135,16 @@ class RunState:
         def told(values: np.ndarray, states: int) -> None:
             move(states)
             if self.folder.due:
-                about = {"calibration": self._calibration_json(), **self.account.to_json()}
-                self.folder.save(
-                    round_,
-                    "asked",
-                    len(values),
-                    lambda: {"values.npy": _npy(values), "state.json": to_json(about)},
-                )
+                self.keep(round_, "asked", {}, lambda: {_VALUES: _npy(values)}, len(values))
 
         return self.ask(observations, round_, 0, asking=Asking(known, told))
 
     def _restore_asked(self, round_: int) -> np.ndarray | None:
         """Take up the answers of an asking that was interrupted, if there are any."""
-        files = self.folder.load(round_, "asked")
-        if files is None:
+        kept = self.take_up(round_, "asked")
+        if kept is None:
             return None
-        state: dict[str, Any] = json.loads(files["state.json"])
-        self._restore_calibration(state["calibration"])
-        self.account.take_up(state)
-        return np.load(io.BytesIO(files["values.npy"]), allow_pickle=False)
-
-    def _calibration_json(self) -> dict[str, Any] | None:
-        return self.calibration.to_json() if self.calibration else None
-
-    def _restore_calibration(self, kept: dict[str, Any] | None) -> None:
-        if kept and self.calibration is None and self.run.probes is not None:
-            self.calibration = Calibration.from_json(kept)
-            self.source = self.calibration.complete(self.run.probes)
+        return np.load(io.BytesIO(kept[0][_VALUES]), allow_pickle=False)
 
     def check_budget(self, states: int) -> None:
         """Refuse to ask the probes of some states where the budget does not allow it.
@@ -170,7 +157,7 @@ class RunState:
             due = self.source.queries(states, moving, 1)
             self.account.check_budget(due, self.run.max_queries)
 
-    def ask(self, observations: np.ndarray, *path: int, asking: Asking | None = None) -> Answers:
+    def ask(self, observations: np.ndarray, *path: int, asking: Asking = UNFOLLOWED) -> Answers:
         """Ask the probes around states, along the directions of a named stream.
 
         Raises:
@@ -189,72 +176,84 @@ class RunState:
         random, order = generator(self.run.seed, "probes", *path), self.run.order
         return ask_probes(expert, observations, probes, scales, random, order, asking)
 
+    def keep(
+        self,
+        round_: int,
+        stage: str,
+        about: dict[str, Any],
+        files: Callable[[], dict[str, bytes]],
+        number: int = 0,
+    ) -> None:
+        """Keep a stage of a round, and with it the account and the calibration.
+
+        Args:
+            round_: The round.
+            stage: Its name.
+            about: What else `take_up` returns of it, as plain JSON values.
+            files: Called for its files, where there is a folder.
+            number: How far the stage has come.
+        """
+        calibration = self.calibration.to_json() if self.calibration else None
+        state = {**about, "calibration": calibration, **self.account.to_json()}
+        self.folder.save(round_, stage, number, lambda: {**files(), _STATE: to_json(state)})
+
+    def take_up(self, round_: int, stage: str) -> tuple[dict[str, bytes], dict[str, Any]] | None:
+        """Return the files of a stage that the interrupted run kept and what it said of them.
+
+        Its account and calibration go on from there. None where it kept nothing.
+        """
+        files = self.folder.load(round_, stage)
+        if files is None:
+            return None
+        state: dict[str, Any] = json.loads(files[_STATE])
+        if state["calibration"] and self.calibration is None and self.run.probes is not None:
+            self.calibration = Calibration.from_json(state["calibration"])
+            self.source = self.calibration.complete(self.run.probes)
+        self.account.take_up(state)  # last: it knows the warnings that completing repeats
+        return files, state
+
     def keep_recorded(self, round_: int, new: Dataset) -> None:
         """Keep what a round has recorded, before its probes are asked."""
-        about = {"episodes": self.episodes, "counts": self.counts, **self.account.to_json()}
-        self.folder.save(
-            round_,
-            "recorded",
-            0,
-            lambda: {"demonstrations.npz": new.to_bytes(), "state.json": to_json(about)},
-        )
+        about = {"episodes": self.episodes, "counts": self.counts}
+        self.keep(round_, "recorded", about, lambda: {_STATES: new.to_bytes()})
 
     def restore_recorded(self, round_: int) -> Dataset | None:
         """Take up what a round of the interrupted run recorded, if it did."""
-        files = self.folder.load(round_, "recorded")
-        if files is None:
-            return None
-        state: dict[str, Any] = json.loads(files["state.json"])
-        self.episodes, self.counts = state["episodes"], Counter(state["counts"])
-        self.account.take_up(state)
-        return Dataset.from_bytes(files["demonstrations.npz"])
+        return self._restore_states(round_, "recorded")
 
     def keep_collected(self, round_: int) -> None:
         """Keep what a round has recorded and asked."""
-        about = {
-            "episodes": self.episodes,
-            "counts": self.counts,
-            "calibration": self._calibration_json(),
-            **self.account.to_json(),
-        }
-        self.folder.save(
-            round_,
-            "collected",
-            0,
-            lambda: {"demonstrations.npz": self.data.to_bytes(), "state.json": to_json(about)},
-        )
+        about = {"episodes": self.episodes, "counts": self.counts}
+        self.keep(round_, "collected", about, lambda: {_STATES: self.data.to_bytes()})
 
     def restore_collected(self, round_: int) -> bool:
         """Take up what a round of the interrupted run kept; return whether there was any."""
-        files = self.folder.load(round_, "collected")
-        if files is None:
-            return False
-        state: dict[str, Any] = json.loads(files["state.json"])
-        self.dataset = Dataset.from_bytes(files["demonstrations.npz"])
-        self.episodes, self.counts = state["episodes"], Counter(state["counts"])
-        self._restore_calibration(state["calibration"])
-        self.account.take_up(state)
-        return True
+        found = self._restore_states(round_, "collected")
+        if found is not None:
+            self.dataset = found
+        return found is not None
+
+    def _restore_states(self, round_: int, stage: str) -> Dataset | None:
+        kept = self.take_up(round_, stage)
+        if kept is None:
+            return None
+        files, about = kept
+        self.episodes, self.counts = about["episodes"], Counter(about["counts"])
+        return Dataset.from_bytes(files[_STATES])
 
     def keep_trained(self, round_: int) -> None:
         """Keep a round's student."""
-        about = {"history": self.history, "steps": self.steps, **self.account.to_json()}
-        self.folder.save(
-            round_,
-            "trained",
-            0,
-            lambda: {"student.safetensors": self.trained.to_bytes(), "state.json": to_json(about)},
-        )
+        about = {"history": self.history, "steps": self.steps}
+        self.keep(round_, "trained", about, lambda: {_STUDENT: self.trained.to_bytes()})
 
     def restore_trained(self, round_: int) -> bool:
         """Take up a round's student; return whether there was one."""
-        files = self.folder.load(round_, "trained")
-        if files is None:
+        kept = self.take_up(round_, "trained")
+        if kept is None:
             return False
-        state: dict[str, Any] = json.loads(files["state.json"])
-        self.student = Student.from_bytes(files["student.safetensors"])
-        self.history, self.steps = state["history"], state["steps"]
-        self.account.take_up(state)
+        files, about = kept
+        self.student = Student.from_bytes(files[_STUDENT])
+        self.history, self.steps = about["history"], about["steps"]
         return True
 
 

@@ -1,6 +1,5 @@
 """One round's training: a fresh student, on all that the run has, with checkpoints."""
 
-import json
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -19,11 +18,12 @@ from fdtasil.progress import Stages
 from fdtasil.runstate import RunState
 from fdtasil.scales import statistics
 from fdtasil.seeding import torch_generator
-from fdtasil.storage import to_json
 from fdtasil.student import Student, StudentShape
 from fdtasil.views import View
 
 __all__ = ["Training"]
+
+_FIT = "fit.safetensors"
 
 
 @dataclass(frozen=True)
@@ -84,7 +84,7 @@ class Training:
     def _warn_of_one_episode(self, seen: Demonstrations) -> None:
         run = self.state.run
         complete = run.trainer is None or self.state.episodes == run.episodes
-        if complete and run.fit.validation > 0 and len(np.unique(seen.episode)) == 1:
+        if complete and run.fit.validation > 0 and seen.episodes == 1:
             warnings.warn(
                 f"validation={run.fit.validation:g} of a single episode: none is held out, and "
                 "the last weights are kept",
@@ -94,12 +94,11 @@ class Training:
 
     def _resumed(self, round_: int) -> tuple[bytes | None, int]:
         """Return the state of the interrupted fit, and the last pool that it asked for."""
-        saved = self.state.folder.load(round_, "training")
-        if saved is None:
+        kept = self.state.take_up(round_, "training")
+        if kept is None:
             return None, -1
-        about = json.loads(saved["state.json"])
-        self.state.account.take_up(about)
-        return saved["fit.safetensors"], about["pool"]
+        files, about = kept
+        return files[_FIT], about["pool"]
 
     def _tell(
         self, round_: int, move: Callable[[int], None]
@@ -118,12 +117,9 @@ class Training:
         def checkpoint(fitted: FitState) -> None:
             if not self.state.folder.due and not self.interrupts.due:
                 return
-            about = {"pool": pools.number, **self.state.account.to_json()}
-            self.state.folder.save(
-                round_,
-                "training",
-                fitted.step,
-                lambda: {"fit.safetensors": fitted.to_bytes(), "state.json": to_json(about)},
+            about = {"pool": pools.number}
+            self.state.keep(
+                round_, "training", about, lambda: {_FIT: fitted.to_bytes()}, fitted.step
             )
             self.interrupts.stop_if_due()
 
