@@ -25,6 +25,8 @@ from benchmarks.speed import SPEED
 from benchmarks.stability import STABILITY
 from benchmarks.trainers import MUJOCO
 from benchmarks.training_length import TRAINING_LENGTH
+from fdtasil.compute import pick_device
+from fdtasil.errors import SettingError
 from fdtasil.storage import write_bytes
 
 BENCHMARKS: dict[str, Benchmark] = {
@@ -53,6 +55,7 @@ def main() -> int:
     running.add_argument("--quick", action="store_true", help="a smoke run of minutes")
     running.add_argument("--workers", type=int, default=1, help="processes of one thread each")
     running.add_argument("--backend", choices=BACKENDS, default="loky")
+    running.add_argument("--device", default="cpu", help="where students are trained: cpu, cuda")
     running.add_argument(
         "--reuse",
         nargs="+",
@@ -71,6 +74,10 @@ def main() -> int:
     benchmark = BENCHMARKS[arguments.name]
     if arguments.command == "draw":
         return _draw(benchmark, arguments.results, arguments.out)
+    try:
+        pick_device(arguments.device)
+    except SettingError as error:
+        parser.error(str(error))
     path = benchmark.results(arguments.out)
     cells = benchmark.cells(arguments.quick)
     failed = run(
@@ -79,6 +86,7 @@ def main() -> int:
         path,
         workers=arguments.workers,
         backend=arguments.backend,
+        device=arguments.device,
         known=known_results((BENCHMARKS[name] for name in arguments.reuse), arguments.out),
     )
     print(f"{benchmark.name}: {len(cells)} cells, {len(failed)} failed now; results in {path}")

@@ -31,8 +31,8 @@ def distillations(
         draw: Rows -> files.
     """
 
-    def run(cell: Cell) -> dict[str, Any]:
-        return _distil(**arguments(cell))
+    def run(cell: Cell, device: str) -> dict[str, Any]:
+        return _distil(**arguments(cell), device=device)
 
     return Benchmark(name, about, cells, run, draw, arguments=arguments)
 

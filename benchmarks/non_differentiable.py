@@ -31,7 +31,7 @@ def cells(quick: bool) -> list[Cell]:
     ]
 
 
-def run(cell: Cell) -> dict[str, Any]:
+def run(cell: Cell, device: str) -> dict[str, Any]:
     """Make the expert anew, distil it, and return what the table needs."""
     arguments = dict(cell)
     box = BLACK_BOXES[arguments.pop("black_box")]
@@ -43,6 +43,7 @@ def run(cell: Cell) -> dict[str, Any]:
             episodes=box.demonstrations,
             horizon=box.horizon,
             max_queries=SLOW_BUDGET if box.slow else None,
+            device=device,
             progress=False,
             **arguments,
         )

@@ -49,11 +49,10 @@ def cells(quick: bool) -> list[Cell]:
     ]
 
 
-def run(cell: Cell) -> dict[str, Any]:
+def run(cell: Cell, device: str) -> dict[str, Any]:
     """Distil in the usual environment, and compare with the expert in every disturbed one."""
-    return compare_under_disturbances(
-        cell["expert"], cell["seed"], STANDARD_METHODS[cell["method"]]
-    )
+    settings = {**STANDARD_METHODS[cell["method"]], "device": device}
+    return compare_under_disturbances(cell["expert"], cell["seed"], settings)
 
 
 def compare_under_disturbances(

@@ -9,9 +9,11 @@ import time
 import traceback
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
+import torch
 from joblib import Parallel, delayed, parallel_config
 from tqdm import tqdm
 
@@ -48,7 +50,8 @@ class Benchmark:
         name: Of the results file and the command.
         about: What it shows, in one sentence.
         cells: Whether to be quick -> the cells, the most telling first.
-        run: A cell -> its result, as plain JSON values. Runs in a process of one thread.
+        run: A cell, and the device to train on -> its result, as plain JSON values. Runs in a
+            process of one thread.
         draw: The rows that have a result -> files by name, for the folder of figures.
         alone: Whether a cell measures time, and must not run beside another.
         arguments: A cell -> the arguments of the distillation that it is. Benchmarks share the
@@ -58,7 +61,7 @@ class Benchmark:
     name: str
     about: str
     cells: Callable[[bool], Sequence[Cell]]
-    run: Callable[[Cell], dict[str, Any]]
+    run: Callable[[Cell, str], dict[str, Any]]
     draw: Callable[[Sequence[Row]], Mapping[str, bytes]]
     alone: bool = False
     arguments: Callable[[Cell], Mapping[str, Any]] | None = None
@@ -75,6 +78,7 @@ def run(
     *,
     workers: int = 1,
     backend: str = "loky",
+    device: str = "cpu",
     known: Mapping[str, Row] | None = None,
 ) -> list[Row]:
     """Run the cells that have no result yet, and append their rows to the results file.
@@ -85,6 +89,7 @@ def run(
         path: The results file, one JSON object a line; made if it is not there.
         workers: Processes at once, one thread each.
         backend: One of `BACKENDS`.
+        device: Where students are trained; processes share a GPU.
         known: From `known_results`: rows of other benchmarks, taken over where the arguments,
             the machine and the versions are the same. Each keeps its commit: that the library
             still does the same is the caller's to know.
@@ -99,14 +104,15 @@ def run(
         with path.open("a") as file:
             file.write("\n")  # a kill cut the last line short: leave it to itself
     about = {"commit": _commit(), "versions": versions()}
-    here = {"versions": about["versions"], "machine": _machine()}
+    here = {"versions": about["versions"], "machine": _machine(device)}
     reused = _reused(benchmark, due, known or {}, here)
     due = [cell for cell in due if _key(cell) not in reused]
     failed = []
     with path.open("a") as file:
         file.writelines(json.dumps(row) + "\n" for row in reused.values())
         file.flush()
-        rows = BACKENDS[backend](benchmark, due, 1 if benchmark.alone else workers)
+        job = partial(_timed, benchmark.run, device)
+        rows = BACKENDS[backend](job, due, 1 if benchmark.alone else workers)
         for row in tqdm(rows, total=len(due), desc=benchmark.name, unit="cell", mininterval=5):
             # The parent alone writes, whole lines at once: a kill loses the cells under way.
             file.write(json.dumps({**row, **about}) + "\n")
@@ -178,15 +184,15 @@ def _reused(
     }
 
 
-def _on_loky(benchmark: Benchmark, cells: Sequence[Cell], workers: int) -> Iterable[Row]:
+def _on_loky(job: Callable[[Cell], Row], cells: Sequence[Cell], workers: int) -> Iterable[Row]:
     if workers == 1:
-        return (_timed(benchmark.run, cell) for cell in cells)
-    jobs = (delayed(_timed)(benchmark.run, cell) for cell in cells)
+        return map(job, cells)
+    jobs = (delayed(job)(cell) for cell in cells)
     with parallel_config(backend="loky", inner_max_num_threads=1):
         return Parallel(n_jobs=workers, return_as="generator_unordered", batch_size=1)(jobs)
 
 
-def _on_ray(benchmark: Benchmark, cells: Sequence[Cell], workers: int) -> Iterator[Row]:
+def _on_ray(job: Callable[[Cell], Row], cells: Sequence[Cell], workers: int) -> Iterator[Row]:
     """Run each cell as a task of one core; the cluster says how many run at once.
 
     joblib's Ray backend gives no result before the last one is there: a killed sweep would lose
@@ -198,8 +204,8 @@ def _on_ray(benchmark: Benchmark, cells: Sequence[Cell], workers: int) -> Iterat
         # Variables of the environment, not arguments, reach numpy and torch before they load.
         variables = {"OMP_NUM_THREADS": "1", "PYTHONPATH": str(HERE.parent)}
         ray.init(runtime_env={"env_vars": variables}, log_to_driver=False)
-    task = ray.remote(num_cpus=1)(_timed)
-    under_way = {task.remote(benchmark.run, cell): cell for cell in cells}
+    task = ray.remote(num_cpus=1)(lambda cell: job(cell))
+    under_way = {task.remote(cell): cell for cell in cells}
     while under_way:
         (ready,), _ = ray.wait(list(under_way), num_returns=1)
         cell = under_way.pop(ready)
@@ -213,23 +219,23 @@ BACKENDS = {"loky": _on_loky, "ray": _on_ray}
 """Where cells run: processes of this machine, or a Ray cluster (RAY_ADDRESS, or a local one)."""
 
 
-def _timed(function: Callable[[Cell], dict[str, Any]], cell: Cell) -> Row:
+def _timed(function: Callable[[Cell, str], dict[str, Any]], device: str, cell: Cell) -> Row:
     # Several processes of several threads each are many times slower than of one each.
     os.environ["OMP_NUM_THREADS"] = "1"
     started = time.perf_counter()
     try:
-        outcome: dict[str, Any] = {"result": function(cell)}
+        outcome: dict[str, Any] = {"result": function(cell, device)}
     except Exception:  # one failed cell must not stop the others; it is kept and shown
         outcome = {"error": traceback.format_exc(limit=-4)}
     seconds = round(time.perf_counter() - started, 2)
-    return {"cell": dict(cell), **outcome, "seconds": seconds, "machine": _machine()}
+    return {"cell": dict(cell), **outcome, "seconds": seconds, "machine": _machine(device)}
 
 
 def _key(cell: Cell) -> str:
     return json.dumps(cell, sort_keys=True)
 
 
-def _machine() -> str:
+def _machine(device: str) -> str:
     """Return what bytes depend on: one name of a processor stands for several generations."""
     model, cpuinfo = platform.processor() or platform.machine(), Path("/proc/cpuinfo")
     if cpuinfo.exists():
@@ -241,7 +247,10 @@ def _machine() -> str:
         if "cpu family" in said:
             vectors = "AVX-512" if "avx512f" in said["flags"] else "no AVX-512"
             model += f" (family {said['cpu family']}, model {said['model']}, {vectors})"
-    return f"{model}, {os.cpu_count()} cores"
+    names = [model, f"{os.cpu_count()} cores"]
+    if device != "cpu":
+        names.append(torch.cuda.get_device_name(device))
+    return ", ".join(names)
 
 
 def _commit() -> str | None:

@@ -37,12 +37,15 @@ BATCH = 100
 STATES = 1500
 STEPS = 150
 ROUNDS = 7
+GPU_ROUNDS = 3
 BATCHES = (64, 256, 1024, 4096)
 
 
 def cells(quick: bool) -> list[Cell]:
     """One cell for each size of a step, each expert that is asked, each environment stepped."""
     found: list[Cell] = [{"what": "step", "size": list(size)} for size in SIZES]
+    if torch.cuda.is_available():
+        found += [{"what": "step on a GPU", "size": list(size)} for size in SIZES]
     experts = [name for name in available() if not name.startswith("paper/")]
     if quick:
         experts = experts[:1]
@@ -50,8 +53,8 @@ def cells(quick: bool) -> list[Cell]:
     return found + [{"what": "stepping", "expert": name} for name in experts]
 
 
-def measure(cell: Cell) -> dict[str, Any]:
-    """Measure one cell, on one thread."""
+def measure(cell: Cell, device: str) -> dict[str, Any]:
+    """Measure one cell, on one thread; what is measured says where it runs, not `device`."""
     with torch_settings(torch.device("cpu")):
         return _MEASURES[cell["what"]](cell)
 
@@ -71,7 +74,26 @@ def _step(cell: Cell) -> dict[str, Any]:
     return {"milliseconds": times}
 
 
-def _task(n: int, m: int, spec: str | None) -> Callable[[], object]:
+def _step_on_a_gpu(cell: Cell) -> dict[str, Any]:
+    """Milliseconds of a step on the CPU and on the GPU, there of a whole training."""
+    n, m = cell["size"]
+    tasks = {
+        f"{source}, {device}": (_task(n, m, source, device, steps), steps)
+        for source in SOURCES
+        for device, steps in (("cpu", STEPS), ("cuda", PRESETS["standard"].fit.steps or STEPS))
+    }
+    times: dict[str, list[float]] = {name: [] for name in tasks}
+    for task, _ in tasks.values():
+        task()
+    for _ in range(GPU_ROUNDS):
+        for name, (task, steps) in tasks.items():
+            times[name].append(_seconds(task) / steps * 1e3)
+    return {"milliseconds": times, "gpu": torch.cuda.get_device_name()}
+
+
+def _task(
+    n: int, m: int, spec: str | None, device: str = "cpu", steps: int = STEPS
+) -> Callable[[], object]:
     random = np.random.default_rng(0)
     observations = random.standard_normal((STATES, n)).astype(np.float32)
     gain = random.standard_normal((n, m)).astype(np.float32) / n**0.5
@@ -83,14 +105,14 @@ def _task(n: int, m: int, spec: str | None) -> Callable[[], object]:
     preset = replace(PRESETS["standard"], calibrated=False)
     probes = preset.complete(Probes.parse(spec))
     probes = probes.with_order(1) if probes else None
-    scales, settings = scales_of(observations), preset.fit_with(steps=STEPS)
+    scales, settings = scales_of(observations), preset.fit_with(steps=steps)
     ones = np.ones(m, np.float32)
 
     def run() -> None:
         shape = StudentShape(n, m, (HIDDEN, HIDDEN), "gelu")
         start = torch_generator(0, "student")
         student = Student(shape, scales.mean, scales.scale, -ones, ones, start)
-        fit(student, demonstrations, probes, ask if probes else None, settings, stream)
+        fit(student.to(device), demonstrations, probes, ask if probes else None, settings, stream)
 
     def asked(pool: int) -> Any:
         assert probes is not None
@@ -177,7 +199,12 @@ def _seconds(function: Callable[[], object]) -> float:
     return time.perf_counter() - started
 
 
-_MEASURES = {"step": _step, "asking": _asking, "stepping": _stepping}
+_MEASURES = {
+    "step": _step,
+    "step on a GPU": _step_on_a_gpu,
+    "asking": _asking,
+    "stepping": _stepping,
+}
 
 
 def draw(rows: Sequence[Row]) -> dict[str, bytes]:
@@ -192,6 +219,11 @@ def draw(rows: Sequence[Row]) -> dict[str, bytes]:
                     _line(f"step, {source}, {name}", "plain", times[source], times["None"])
                 )
             lines.append(_line(f"plain step, {name}", "floor", times["None"], times["floor"]))
+        elif cell["what"] == "step on a GPU":
+            times, name = result["milliseconds"], "{}/{}".format(*cell["size"])
+            for source in map(str, SOURCES):
+                what = f"step, {source.replace('None', 'plain')}, {name}, {result['gpu']}"
+                lines.append(_line(what, "CPU", times[f"{source}, cuda"], times[f"{source}, cpu"]))
         elif cell["what"] == "asking":
             rates = result["rows_per_second"]
             lines.append(_line(f"rows, {cell['expert']}", "session", rates["ours"], rates["bare"]))

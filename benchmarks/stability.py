@@ -58,7 +58,7 @@ def cells(quick: bool) -> list[Cell]:
     ]
 
 
-def run(cell: Cell) -> dict[str, Any]:
+def run(cell: Cell, device: str) -> dict[str, Any]:
     """Distil with the paper's settings, and judge from fresh starts and from those learnt from."""
     order, source, seed = cell["order"], cell["source"], cell["seed"]
     expert = make_expert(seed)
@@ -82,6 +82,7 @@ def run(cell: Cell) -> dict[str, Any]:
         hidden=(64, 64, 64),
         steps=cell["steps"],
         seed=seed,
+        device=device,
         evaluation_episodes=0,  # judged below
         progress=False,
     )

@@ -23,9 +23,6 @@ class Batches:
         answers: Number of the pool -> the expert's answers; None without probes.
         random: Name of a stream -> its generator; an epoch's order depends on its number only.
         device: Where the data and the minibatches are.
-
-    Attributes:
-        gain: Of the answers in use; see `Answers`.
     """
 
     def __init__(
@@ -39,7 +36,6 @@ class Batches:
         self._observations = torch.from_numpy(demonstrations.observations).to(device)
         self._actions = torch.from_numpy(demonstrations.actions).to(device)
         self._random, self._device = random, device
-        self.gain = 1.0
         self._dealer: _Dealer | None = None
         if probes is not None and answers is not None:
             self._dealer = _Dealer(probes, answers, len(demonstrations), random("offset"), device)
@@ -48,18 +44,24 @@ class Batches:
         """Deal out each of `rows` once, in `batches` minibatches of (almost) equal size."""
         order = torch.randperm(len(rows), generator=self._random(f"epoch {number}"))
         if self._dealer is not None:
-            self.gain = self._dealer.load(number)
-        for part in rows[order].to(self._device).tensor_split(batches):
+            self._dealer.load(number)
+        for part in rows[order].to(self._device, non_blocking=True).tensor_split(batches):
             yield self.visit(part, number)
 
     def visit(self, rows: Tensor, number: int) -> Minibatch:
-        """Return the minibatch of some states at their visit of that number."""
-        around = self._dealer.deal(rows, number) if self._dealer is not None else (None, None)
-        return Minibatch(self._observations[rows], self._actions[rows], *around)
+        """Return the minibatch of some states, given on the device, at their visit `number`."""
+        seen, said = self._observations[rows], self._actions[rows]
+        if self._dealer is None:
+            return Minibatch(seen, said)
+        return Minibatch(seen, said, *self._dealer.deal(rows, number), self._dealer.gain)
 
 
 class _Dealer:
-    """The expert's answers around each state; a visit of the state uses the next of them."""
+    """The expert's answers around each state; a visit of the state uses the next of them.
+
+    Attributes:
+        gain: Of the answers in use.
+    """
 
     def __init__(
         self,
@@ -74,13 +76,12 @@ class _Dealer:
         self._offset = torch.randint(2**31, (states, 1), generator=random).to(device)
         self._fill(0)
 
-    def load(self, visit: int) -> float:
-        """Ask anew where a visit needs answers that the pool does not have; return the gain."""
+    def load(self, visit: int) -> None:
+        """Ask anew where a visit needs answers that the pool does not have."""
         if self._probes.resample:
             pool = visit * self._used // self._numbers.shape[1]
             if pool != self._number:
                 self._fill(pool)
-        return self._gain
 
     def deal(self, rows: Tensor, visit: int) -> tuple[Tensor, Tensor]:
         """Return displacements (B, used, n) and values (B, used, p, m) of the states' visit."""
@@ -91,7 +92,7 @@ class _Dealer:
 
     def _fill(self, number: int) -> None:
         answers = self._ask(number)
-        self._number, self._gain = number, answers.gain
+        self._number, self.gain = number, answers.gain
         self._bank = torch.from_numpy(answers.displacements).to(self._device)
         self._numbers = torch.from_numpy(np.ascontiguousarray(answers.numbers)).to(self._device)
         self._values = torch.from_numpy(answers.values).to(self._device)

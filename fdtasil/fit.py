@@ -16,6 +16,7 @@ from fdtasil.errors import SettingError
 from fdtasil.fitstate import FitState
 from fdtasil.loss import Minibatch, Weights, taylor_loss
 from fdtasil.probes import Probes
+from fdtasil.steps import gradient_step
 from fdtasil.student import Student
 
 __all__ = ["Fit", "Hooks", "fit", "hold_out"]
@@ -175,33 +176,30 @@ def fit(
         weight_decay=settings.weight_decay,
         eps=settings.epsilon,
         fused=True,
+        capturable=device.type == "cuda",
     )
     weights = Weights(settings.weight, settings.curvature_weight if order == 2 else None)
     stencil = probes.stencil if probes else None
     # Taken once, of the first pool: two validations then differ by the student alone.
-    judges = [batches.visit(part, 0) for part in held_out.split(settings.batch_size) if len(part)]
+    parts = held_out.to(device).split(settings.batch_size)
+    judges = [batches.visit(part, 0) for part in parts if len(part)]
     state = FitState(student, optimiser)
     if resume is not None:
         state.restore(resume)
 
     def loss_of(batch: Minibatch) -> Tensor:
-        loss = taylor_loss(student, batch, stencil, weights, batches.gain)
+        loss = taylor_loss(student, batch, stencil, weights)
         return torch.stack([loss.total, loss.action, loss.derivative, loss.curvature])
 
+    clipped = settings.max_gradient_norm
+    step = gradient_step(student, optimiser, loss_of, clipped, device)
     first_epoch = state.step // per_epoch
     dealt = _deal(batches, training, per_epoch, first_epoch)
     student.train()
     for batch in islice(dealt, max(0, steps - state.step)):
         if state.step % per_epoch == 0 and state.step > 0:
             told.checkpoint(state)
-        optimiser.param_groups[0]["lr"] = _cosine(settings.learning_rate, state.step, steps)
-        losses = loss_of(batch)
-        optimiser.zero_grad(set_to_none=True)
-        losses[0].backward()
-        if settings.max_gradient_norm is not None:
-            torch.nn.utils.clip_grad_norm_(student.parameters(), settings.max_gradient_norm)
-        optimiser.step()
-        state.count(losses.detach())
+        state.count(step(batch, _cosine(settings.learning_rate, state.step, steps)))
         if state.step % _LOG_EVERY == 0 or state.step == steps:
             held = _held_out_loss(loss_of, judges)
             told.entry(state.log(held))

@@ -50,12 +50,14 @@ class FitState:
         Raises:
             FitError: Naming the first step with such a loss, if the losses show it.
         """
-        bad = [not torch.isfinite(losses).all() for losses in self._recent]
+        # Read in one piece: each reading waits for the device.
+        recent = torch.stack(self._recent).tolist() if self._recent else []
+        bad = [not all(map(math.isfinite, losses)) for losses in recent]
         if any(bad):
             first = bad.index(True)
-            step, loss = self.step - len(bad) + first + 1, float(self._recent[first][0])
-            found = f"the loss became {loss} at step {step}"
-        elif not all(torch.isfinite(weights).all() for weights in self._student.parameters()):
+            step = self.step - len(bad) + first + 1
+            found = f"the loss became {recent[first][0]} at step {step}"
+        elif not self._finite_weights():
             found = f"the student's weights are not finite after step {self.step}"
         elif held_out is not None and not math.isfinite(held_out):
             found = f"the loss of the held-out episodes became {held_out} at step {self.step}"
@@ -66,6 +68,10 @@ class FitState:
             "finite numbers",
             "lower learning_rate, or check the expert's answers for outliers",
         )
+
+    def _finite_weights(self) -> bool:
+        parts = [torch.isfinite(weights).all() for weights in self._student.parameters()]
+        return not parts or bool(torch.stack(parts).all())
 
     def log(self, held_out: float | None) -> dict[str, float]:
         """Make an entry of the steps since the last one, and keep the weights if they are best.

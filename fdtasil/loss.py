@@ -19,12 +19,15 @@ class Minibatch:
         actions: (B, m) expert actions.
         displacements: (B, k, n) where each state is probed, or None without probes.
         values: (B, k, p, m) what the expert said there, or None; see `Answers`.
+        gain: From `Answers`, so that the weights mean the same for every design, number of
+            probes and radius.
     """
 
     observations: Tensor
     actions: Tensor
     displacements: Tensor | None = None
     values: Tensor | None = None
+    gain: float = 1.0
 
 
 @dataclass(frozen=True)
@@ -60,7 +63,7 @@ class TaylorLoss:
 
 
 def taylor_loss(
-    student: nn.Module, batch: Minibatch, stencil: Stencil | None, weights: Weights, gain: float
+    student: nn.Module, batch: Minibatch, stencil: Stencil | None, weights: Weights
 ) -> TaylorLoss:
     """Compare a student with the expert's answers (TaSIL, equation 5, p = 0, 1, 2; appendix).
 
@@ -73,12 +76,10 @@ def taylor_loss(
         batch: B states with k probes each.
         stencil: How the expert was differenced; None without probes (p = 0).
         weights: Of the terms.
-        gain: From `Answers`, so that the weights mean the same for every design, number of
-            probes and radius.
 
     Example:
         >>> batch = Minibatch(torch.zeros(2, 3), torch.ones(2, 3))
-        >>> taylor_loss(nn.Identity(), batch, None, Weights(0.0), gain=1.0).total
+        >>> taylor_loss(nn.Identity(), batch, None, Weights(0.0)).total
         tensor(1.7321)
     """
     if stencil is None or batch.displacements is None or batch.values is None:
@@ -90,10 +91,10 @@ def taylor_loss(
     found = errors(student, batch, batch.displacements, batch.values, stencil, second=second)
     probes = batch.displacements.shape[1]
     action = _mean_norm(found[0])
-    derivative = gain / probes**0.5 * _mean_norm(found[1].flatten(1))
+    derivative = batch.gain / probes**0.5 * _mean_norm(found[1].flatten(1))
     total, curvature = action + weights.derivative * derivative, torch.zeros_like(action)
     if weights.curvature is not None:
-        curvature = gain**2 / probes**0.5 * _mean_norm(found[2].flatten(1))
+        curvature = batch.gain**2 / probes**0.5 * _mean_norm(found[2].flatten(1))
         total = total + weights.curvature * curvature
     return TaylorLoss(total, action, derivative, curvature)
 
@@ -109,8 +110,9 @@ def _difference_errors(
 ) -> tuple[Tensor, ...]:
     """Return the errors (B, m) at the states, and (B, k, m) of the first (and second) ones."""
     rows, n = batch.observations.shape
-    offsets = torch.tensor(stencil.offsets, device=displacements.device)
-    points = batch.observations[:, None, None, :] + displacements[:, :, None, :] * offsets[:, None]
+    # Numbers, not tensors of them: a tensor would wait for the GPU at every step.
+    moved = torch.stack([offset * displacements for offset in stencil.offsets], dim=2)
+    points = batch.observations[:, None, None, :] + moved
     # One forward pass over all points: a stencil must see one and the same function.
     answers = student(torch.cat([batch.observations, points.reshape(-1, n)]))
     action_error = answers[:rows] - batch.actions
@@ -118,9 +120,10 @@ def _difference_errors(
 
     # The difference of errors is the error of the difference: both are linear.
     def difference(weights: tuple[float, ...], centre: float) -> Tensor:
-        factors = torch.tensor(weights, device=displacements.device)
-        around = torch.einsum("p,bkpm->bkm", factors, value_errors)
-        return around + centre * action_error[:, None, :]
+        total = centre * action_error[:, None, :]
+        for weight, errors in zip(weights, value_errors.unbind(dim=2), strict=True):
+            total = total + weight * errors
+        return total
 
     first = difference(stencil.weights, stencil.centre)
     if not second or stencil.second is None:

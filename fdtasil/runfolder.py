@@ -151,8 +151,8 @@ def _read_config(path: Path) -> dict[str, Any]:
 
 def _check_same(before: dict[str, Any], now: dict[str, Any], path: Path) -> None:
     changed = _differences({**before, _FREE: None}, {**now, _FREE: None})
-    versions = [change for change in changed if change.startswith("versions.")]
-    settings = [change for change in changed if not change.startswith("versions.")]
+    surroundings = [change for change in changed if change.startswith(("versions.", "device "))]
+    settings = [change for change in changed if change not in surroundings]
     if settings:
         shown = "; ".join(settings[:8]) + (f"; and {len(settings) - 8} more" * (len(settings) > 8))
         raise SettingError(
@@ -160,8 +160,9 @@ def _check_same(before: dict[str, Any], now: dict[str, Any], path: Path) -> None
             "the same arguments as at the beginning",
             "repeat them, or start anew in another folder",
         )
-    if versions:
-        message = f"resumed with other versions, so bytes may differ: {'; '.join(versions)}"
+    if surroundings:
+        found = "; ".join(surroundings)
+        message = f"resumed with other versions or on another device, so bytes may differ: {found}"
         warnings.warn(message, FdtasilWarning, stacklevel=4)
 
 

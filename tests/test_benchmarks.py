@@ -18,7 +18,7 @@ from benchmarks.statistics import interquartile_mean, interval, paired_differenc
 ROOT = Path(__file__).parent.parent
 
 
-def double(cell):
+def double(cell, device):
     if cell["number"] == 3:
         raise ValueError("three is refused")
     return {"double": 2 * cell["number"]}
@@ -44,7 +44,7 @@ def test_a_failed_cell_is_kept_and_does_not_stop_the_others(workers, tmp_path):
         assert row.keys() >= {"versions", "machine", "seconds", "commit"}
 
 
-def threads(cell):
+def threads(cell, device):
     import fdtasil  # noqa: F401  (as a cell's process does)
     from fdtasil.compute import torch_settings
 
@@ -162,7 +162,7 @@ def arguments(cell):
 
 
 def tripling(name, cells, ran):
-    def triple(cell):
+    def triple(cell, device):
         ran.append(cell["number"])
         return arguments(cell)
 

@@ -6,51 +6,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from toy_tasks import linear_task, new_student, stream
 
-from fdtasil.answers import Answers, ask_probes
+from fdtasil.answers import Answers
 from fdtasil.batches import Batches
 from fdtasil.compute import pick_device, torch_settings
-from fdtasil.demonstrations import Demonstrations
 from fdtasil.errors import FdtasilWarning, FitError, SettingError
-from fdtasil.experts import load_expert
 from fdtasil.fit import Hooks, fit
 from fdtasil.presets import PRESETS
-from fdtasil.probes import Probes
 from fdtasil.scales import statistics
-from fdtasil.seeding import torch_generator
-from fdtasil.student import Student, StudentShape
 
 STANDARD = PRESETS["standard"]
-
-
-def linear_task(states=200, n=6, m=2, spec=None):
-    random = np.random.default_rng(0)
-    gain = random.standard_normal((m, n)).astype(np.float32) / 4
-    observations = random.standard_normal((states, n)).astype(np.float32)
-    expert = load_expert(lambda rows: rows @ gain.T)
-    number, actions = np.zeros(states, np.int32), expert.ask(observations, "label")
-    demonstrations = Demonstrations(
-        observations, actions, number, number, actions, np.zeros(states), number > 0
-    )
-    if spec is None:
-        return demonstrations, None, None
-    probes = replace(STANDARD, calibrated=False).complete(Probes.parse(spec)).with_order(1)
-    scales = statistics(observations)
-
-    def ask(pool):
-        return ask_probes(expert, observations, probes, scales, np.random.default_rng(pool))
-
-    return demonstrations, probes, ask
-
-
-def stream(name):
-    return torch_generator(0, name)
-
-
-def new_student(n=6, m=2, hidden=(32,)):
-    zeros, ones, bound = np.zeros(n), np.ones(n), np.full(m, 3.0)
-    shape = StudentShape(n, m, hidden, "gelu")
-    return Student(shape, zeros, ones, -bound, bound, torch_generator(0))
 
 
 def train(spec=None, student=None, **changes):

@@ -34,6 +34,7 @@ ORDER = [
     "evaluation",
     "fit",
     "fitstate",
+    "steps",
     "batches",
     "loss",
     "views",

@@ -23,7 +23,7 @@ def smooth_expert(n=6, m=3):
 
 
 def batch_of(module, spec, states, order=1):
-    """The whole stencil of every state, and the stencil's gain."""
+    """The whole stencil of every state, and which it is."""
     probes = (
         replace(PRESETS["standard"], calibrated=False)
         .complete(Probes.parse(spec))
@@ -37,8 +37,9 @@ def batch_of(module, spec, states, order=1):
         torch.from_numpy(expert.ask(states, "label")),
         torch.from_numpy(answers.displacements[answers.numbers]),
         torch.from_numpy(answers.values),
+        answers.gain,
     )
-    return batch, probes.stencil, answers.gain
+    return batch, probes.stencil
 
 
 @pytest.fixture
@@ -51,8 +52,8 @@ def states():
 )
 def test_the_loss_is_zero_at_the_expert(states, spec):
     expert = smooth_expert()
-    batch, stencil, gain = batch_of(expert, spec, states)
-    loss = taylor_loss(expert, batch, stencil, Weights(0.5), gain)
+    batch, stencil = batch_of(expert, spec, states)
+    loss = taylor_loss(expert, batch, stencil, Weights(0.5))
     assert float(loss.total) < 1e-4
 
 
@@ -65,8 +66,8 @@ def test_the_analytic_loss_and_gradient_agree_with_the_differences(states):
     found = {}
     for spec in ("basis,central,radius=0.02", "jacobian"):
         student.zero_grad()
-        batch, stencil, gain = batch_of(expert, spec, states)
-        loss = taylor_loss(student, batch, stencil, Weights(0.5), gain)
+        batch, stencil = batch_of(expert, spec, states)
+        loss = taylor_loss(student, batch, stencil, Weights(0.5))
         loss.total.backward()
         gradient = torch.cat([p.grad.flatten() for p in student.parameters()])
         found[spec] = loss.total.detach(), gradient
@@ -82,8 +83,8 @@ def test_a_linear_difference_is_the_exact_derivative(states):
         matrix.weight.copy_(torch.arange(18.0).reshape(3, 6))
     expected = float((matrix.weight * torch.from_numpy(states.std(axis=0))).norm())
     for spec in ("basis", "basis,central,radius=3", "orthogonal:6,radius=1", "jacobian"):
-        batch, stencil, gain = batch_of(matrix, spec, states)
-        loss = taylor_loss(lambda x: 0 * x[:, :3], batch, stencil, Weights(1.0), gain)
+        batch, stencil = batch_of(matrix, spec, states)
+        loss = taylor_loss(lambda x: 0 * x[:, :3], batch, stencil, Weights(1.0))
         assert float(loss.derivative) == pytest.approx(expected, rel=1e-4), spec
 
 
@@ -92,8 +93,8 @@ def test_labels_are_the_action_error_at_the_moved_states(states):
     with torch.no_grad():
         for parameter in student.parameters():
             parameter.mul_(0.8)
-    batch, stencil, gain = batch_of(expert, "sphere:1,labels,radius=0.5", states)
-    loss = taylor_loss(student, batch, stencil, Weights(1.0), gain)
+    batch, stencil = batch_of(expert, "sphere:1,labels,radius=0.5", states)
+    loss = taylor_loss(student, batch, stencil, Weights(1.0))
     moved = batch.observations + batch.displacements[:, 0]
     with torch.no_grad():
         error = (student(moved) - expert(moved)).norm(dim=-1).mean()
@@ -111,8 +112,8 @@ def test_second_differences_agree_with_exact_second_derivatives():
     found = {}
     for spec in ("orthogonal:10,central,radius=0.05", "jacobian"):
         student.zero_grad()
-        batch, stencil, gain = batch_of(expert, spec, states, order=2)
-        loss = taylor_loss(student, batch, stencil, Weights(0.5, 0.1), gain)
+        batch, stencil = batch_of(expert, spec, states, order=2)
+        loss = taylor_loss(student, batch, stencil, Weights(0.5, 0.1))
         loss.total.backward()
         gradient = torch.cat([p.grad.flatten() for p in student.parameters()])
         found[spec] = loss.curvature.detach(), gradient
@@ -132,8 +133,8 @@ def test_a_parabola_has_its_own_second_difference(states):
 
     curvatures = []
     for spec in ("orthogonal:6,central", "orthogonal:6,central,radius=2", "jacobian"):
-        batch, stencil, gain = batch_of(Parabola(), spec, states, order=2)
-        loss = taylor_loss(lambda x: 0 * x[:, :1], batch, stencil, Weights(1.0, 1.0), gain)
+        batch, stencil = batch_of(Parabola(), spec, states, order=2)
+        loss = taylor_loss(lambda x: 0 * x[:, :1], batch, stencil, Weights(1.0, 1.0))
         curvatures.append(float(loss.curvature.detach()))
     # E |u'Hu|, sqrt of the mean over a frame, lies near the trace of the whitened Hessian.
     assert curvatures == pytest.approx([float((states.std(axis=0) ** 2).sum())] * 3, rel=0.05)

@@ -87,7 +87,7 @@ def test_a_constant_error_ends_where_gamma_says():
     ("order", "source"), [(0, "none"), (1, "differences"), (2, "differences"), (2, "jacobian")]
 )
 def test_a_tiny_cell_runs(order, source):
-    result = STABILITY.run({"order": order, "source": source, "seed": 0, "steps": 3})
+    result = STABILITY.run({"order": order, "source": source, "seed": 0, "steps": 3}, "cpu")
     assert json.loads(json.dumps(result, allow_nan=False)) == result
     assert len(result["fresh"]["gap"]["median"]) == len(result["nus"]) == len(NUS)
     assert (result["derivative_error"] > 0) == (order > 0)

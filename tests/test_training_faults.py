@@ -164,6 +164,24 @@ def test_a_student_that_was_spoilt_is_not_saved(quick, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.fault(106)
+def test_a_full_gpu_leaves_a_run_that_goes_on_elsewhere(linear, tmp_path, monkeypatch):
+    def full(*arguments, **named):
+        raise torch.OutOfMemoryError("CUDA out of memory. Tried to allocate 2.00 MiB. GPU 0 has")
+
+    run = {**QUICK, "probes": 4}
+    with monkeypatch.context() as patch:
+        patch.setattr("fdtasil.training.fit", full)
+        patch.setattr("fdtasil.pipeline.pick_device", lambda name: torch.device("cpu"))
+        with pytest.raises(FitError, match="no memory left on cpu: CUDA out of memory\n") as error:
+            fdtasil.distill(linear, TOY, out=tmp_path, device="cuda", **run)
+    assert any("resume=" in note for note in error.value.__notes__)
+    with pytest.warns(fdtasil.FdtasilWarning, match="device was 'cuda', is 'cpu'"):
+        resumed = fdtasil.distill(linear, TOY, resume=tmp_path, **run)
+    whole = fdtasil.distill(linear, TOY, **run)
+    assert resumed.student.to_bytes() == whole.student.to_bytes()
+
+
 @pytest.mark.fault(100)
 @pytest.mark.parametrize("after", [1500, 2500, 3000])
 def test_an_expert_that_fails_late_leaves_a_run_that_goes_on(after, linear, tmp_path, monkeypatch):
