@@ -11,6 +11,7 @@ from conftest import GAIN, QUICK, TOY
 from toy_tasks import linear_task, new_student, stream
 
 import fdtasil
+from fdtasil.errors import FdtasilWarning, FitError
 from fdtasil.fit import Hooks, fit
 from fdtasil.loss import Minibatch
 from fdtasil.presets import PRESETS
@@ -134,7 +135,7 @@ def test_a_run_on_the_gpu_gives_a_student_for_the_cpu(setting):
 
 @pytest.mark.fault(100)
 def test_a_loss_that_is_not_finite_stops_the_training_on_the_gpu():
-    with pytest.raises(fdtasil.FitError, match="finite"):
+    with pytest.raises(FitError, match="finite"):
         train("4", learning_rate=1e38)
 
 
@@ -145,11 +146,11 @@ def test_a_gpu_that_is_full_is_named(tmp_path):
     torch.cuda.set_per_process_memory_fraction(1e-9)
     torch.cuda.empty_cache()
     try:
-        with pytest.raises(fdtasil.FitError, match="no memory left on cuda"):
+        with pytest.raises(FitError, match="no memory left on cuda"):
             fdtasil.distill(Expert(), TOY, out=tmp_path / "run", **run)
     finally:
         torch.cuda.set_per_process_memory_fraction(1.0)
     run["device"] = "cpu"
-    with pytest.warns(fdtasil.FdtasilWarning, match="another device"):
+    with pytest.warns(FdtasilWarning, match="another device"):
         result = fdtasil.distill(Expert(), TOY, resume=tmp_path / "run", **run)
     assert result.queries["probe"] > 0
