@@ -5,7 +5,7 @@ from contextlib import contextmanager
 
 import torch
 
-from fdtasil.errors import SettingError
+from fdtasil.errors import FitError, SettingError
 
 __all__ = ["pick_device", "torch_settings"]
 
@@ -56,6 +56,9 @@ def torch_settings(device: torch.device, threads: int = 1) -> Iterator[str]:
     Yields:
         The float32 matrix-product precision in force: `"medium"` where it was measured to be
         exact, the caller's own setting elsewhere.
+
+    Raises:
+        FitError: If the GPU has no memory left, here or inside the block.
     """
     before_threads, before_precision = (
         torch.get_num_threads(),
@@ -67,6 +70,12 @@ def torch_settings(device: torch.device, threads: int = 1) -> Iterator[str]:
         if _product_error(device) > _ACCEPTED_ERROR:
             torch.set_float32_matmul_precision(before_precision)
         yield torch.get_float32_matmul_precision()
+    except torch.OutOfMemoryError as error:
+        raise FitError(
+            f"no GPU memory left: {str(error).partition('. ')[0]}",
+            "room for all demonstrations, the answers around them and a training step",
+            'end what else uses the GPU, or write device="cpu"',
+        ) from error
     finally:
         torch.set_float32_matmul_precision(before_precision)
         torch.set_num_threads(before_threads)

@@ -9,7 +9,7 @@ import torch
 
 from fdtasil.answers import Answers
 from fdtasil.demonstrations import Demonstrations
-from fdtasil.errors import FdtasilWarning, FitError
+from fdtasil.errors import FdtasilWarning
 from fdtasil.events import Callback, Event
 from fdtasil.fit import Hooks, fit, hold_out
 from fdtasil.fitstate import FitState
@@ -59,24 +59,17 @@ class Training:
         total = run.fit.total_steps(len(rows))
         student = self._fresh(seen, round_)
         with self.stages.stage(f"training, round {round_}", total, "step") as move:
-            try:
-                entries = fit(
-                    student.to(self.device),
-                    seen,
-                    state.source,
-                    pools if state.source else None,
-                    run.fit,
-                    random,
-                    order=run.order,
-                    hooks=Hooks(self._tell(round_, move), self._checkpoint(round_, pools)),
-                    resume=resume,
-                )
-            except torch.OutOfMemoryError as error:
-                raise FitError(
-                    f"no memory left on {self.device}: {str(error).partition('. ')[0]}",
-                    "room for all demonstrations, the answers around them and a training step",
-                    'end what else uses the GPU, or write device="cpu"',
-                ) from error
+            entries = fit(
+                student.to(self.device),
+                seen,
+                state.source,
+                pools if state.source else None,
+                run.fit,
+                random,
+                order=run.order,
+                hooks=Hooks(self._tell(round_, move), self._checkpoint(round_, pools)),
+                resume=resume,
+            )
         state.student = student.cpu()
         state.steps += int(entries[-1]["step"])
         state.history += [{"round": round_, **entry} for entry in entries]

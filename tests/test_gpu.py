@@ -11,7 +11,7 @@ from conftest import GAIN, QUICK, TOY
 from toy_tasks import linear_task, new_student, stream
 
 import fdtasil
-from fdtasil.errors import FdtasilWarning, FitError
+from fdtasil.errors import FitError
 from fdtasil.fit import Hooks, fit
 from fdtasil.loss import Minibatch
 from fdtasil.presets import PRESETS
@@ -140,17 +140,13 @@ def test_a_loss_that_is_not_finite_stops_the_training_on_the_gpu():
 
 
 @pytest.mark.fault(106)
-def test_a_gpu_that_is_full_is_named(tmp_path):
-    """And the run goes on elsewhere: what was asked is not asked again."""
-    run = {"device": "cuda", "probes": 5, "progress": False, **QUICK}
+def test_a_gpu_that_is_full_is_named_before_the_expert_is_asked():
+    asked = []
     torch.cuda.set_per_process_memory_fraction(1e-9)
     torch.cuda.empty_cache()
     try:
-        with pytest.raises(FitError, match="no memory left on cuda"):
-            fdtasil.distill(Expert(), TOY, out=tmp_path / "run", **run)
+        with pytest.raises(FitError, match="no GPU memory left"):
+            fdtasil.distill(asked.append, TOY, 5, device="cuda", progress=False, **QUICK)
     finally:
         torch.cuda.set_per_process_memory_fraction(1.0)
-    run["device"] = "cpu"
-    with pytest.warns(FdtasilWarning, match="another device"):
-        result = fdtasil.distill(Expert(), TOY, resume=tmp_path / "run", **run)
-    assert result.queries["probe"] > 0
+    assert asked == []

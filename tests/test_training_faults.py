@@ -173,7 +173,7 @@ def test_a_full_gpu_leaves_a_run_that_goes_on_elsewhere(linear, tmp_path, monkey
     with monkeypatch.context() as patch:
         patch.setattr("fdtasil.training.fit", full)
         patch.setattr("fdtasil.pipeline.pick_device", lambda name: torch.device("cpu"))
-        with pytest.raises(FitError, match="no memory left on cpu: CUDA out of memory\n") as error:
+        with pytest.raises(FitError, match="no GPU memory left: CUDA out of memory\n") as error:
             fdtasil.distill(linear, TOY, out=tmp_path, device="cuda", **run)
     assert any("resume=" in note for note in error.value.__notes__)
     with pytest.warns(fdtasil.FdtasilWarning, match="device was 'cuda', is 'cpu'"):
