@@ -3,7 +3,7 @@
 from collections.abc import Sequence
 from typing import Any
 
-from benchmarks.comparison import draw_methods, scores_of
+from benchmarks.comparison import Column, Scores, draw_scores, scores_of, scores_text
 from benchmarks.controllers import available
 from benchmarks.distillation import distillations, usual_arguments
 from benchmarks.finite_difference import SEEDS, experts
@@ -53,8 +53,25 @@ def arguments(cell: Cell) -> dict[str, Any]:
 
 
 def draw(rows: Sequence[Row]) -> dict[str, bytes]:
-    """One picture and two tables, of the budgets that are complete."""
-    return draw_methods("mujoco", scores_of(rows, list(METHODS), len(SEEDS)), list(METHODS), PAIRS)
+    """A picture of each budget, and two tables, of the cells that have every method and seed."""
+    scores = scores_of(rows, list(METHODS), len(SEEDS))
+    if not scores:
+        return {}
+    pictures = {
+        f"mujoco_{budget}.png": draw_scores(_by_trainer(scores, budget), list(SOURCES), str, "")
+        for budget in dict.fromkeys(budget for _, budget in scores)
+    }
+    return {**pictures, "mujoco.md": scores_text(scores, list(METHODS), PAIRS).encode()}
+
+
+def _by_trainer(scores: Scores, budget: Column) -> Scores:
+    """Return the scores of one budget, trainers across and sources as methods."""
+    return {
+        (expert, trainer): {source: found[f"{trainer}, {source}"] for source in SOURCES}
+        for (expert, column), found in scores.items()
+        for trainer in TRAINERS
+        if column == budget
+    }
 
 
 MUJOCO = distillations("mujoco", __doc__ or "", cells, arguments, draw)
