@@ -55,7 +55,11 @@ def main() -> int:
     running.add_argument("--quick", action="store_true", help="a smoke run of minutes")
     running.add_argument("--workers", type=int, default=1, help="processes of one thread each")
     running.add_argument("--backend", choices=BACKENDS, default="loky")
-    running.add_argument("--device", default="cpu", help="where students are trained: cpu, cuda")
+    running.add_argument(
+        "--device",
+        default="cpu",
+        help="where students are trained: cpu, cuda; cells that have a result are not run again",
+    )
     running.add_argument(
         "--reuse",
         nargs="+",
@@ -74,10 +78,8 @@ def main() -> int:
     benchmark = BENCHMARKS[arguments.name]
     if arguments.command == "draw":
         return _draw(benchmark, arguments.results, arguments.out)
-    try:
-        pick_device(arguments.device)
-    except SettingError as error:
-        parser.error(str(error))
+    if arguments.device != "cpu":
+        _check_device(arguments.device, arguments.backend, benchmark, parser)
     path = benchmark.results(arguments.out)
     cells = benchmark.cells(arguments.quick)
     failed = run(
@@ -91,6 +93,20 @@ def main() -> int:
     )
     print(f"{benchmark.name}: {len(cells)} cells, {len(failed)} failed now; results in {path}")
     return min(len(failed), 1)
+
+
+def _check_device(
+    device: str, backend: str, benchmark: Benchmark, parser: argparse.ArgumentParser
+) -> None:
+    """End the program where a benchmark can't train there."""
+    if backend == "ray":
+        parser.error(f"--device {device} beside --backend ray: tasks there ask for a core, no GPU")
+    if benchmark.alone:
+        parser.error(f"--device {device}: {benchmark.name} says itself what it measures where")
+    try:
+        pick_device(device)
+    except SettingError as error:
+        parser.error(str(error))
 
 
 def _list() -> int:

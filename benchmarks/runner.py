@@ -85,7 +85,7 @@ def run(
 
     Args:
         benchmark: What is run.
-        cells: Which cells.
+        cells: Which cells; one that has a result, from whichever machine, is not run again.
         path: The results file, one JSON object a line; made if it is not there.
         workers: Processes at once, one thread each.
         backend: One of `BACKENDS`.

@@ -25,6 +25,7 @@ from fdtasil.shell import (
     EnvironmentId,
     OptionalEnvironment,
     OptionalExpert,
+    OptionalText,
     PolicyPath,
     as_command,
     import_module_of,
@@ -35,11 +36,13 @@ __all__ = ["COMMANDS", "main"]
 
 COMMAND = "command.json"
 """File of a run's folder with the arguments that `fdtasil distill` was called with."""
-_BESIDE = ("resume", "max_queries")  # what may be said of a run that goes on
+_BESIDE = ("resume", "max_queries", "device")  # what may be said of a run that goes on
 
 
 def _distill(compare: bool, **arguments: Any) -> None:
     resume = arguments["resume"]
+    if arguments["device"] is None:
+        del arguments["device"]  # the library's own, or the one that the run was begun on
     import_module_of(arguments["env"])
     if resume is None:
         with _remembering(arguments):
@@ -47,7 +50,8 @@ def _distill(compare: bool, **arguments: Any) -> None:
     else:
         if arguments["expert"] is None and arguments["env"] is None:
             _check_alone(arguments)
-            mine = {name: arguments[name] for name in _BESIDE if arguments[name] is not None}
+            mine = {name: arguments.get(name) for name in _BESIDE}
+            mine = {name: value for name, value in mine.items() if value is not None}
             arguments = {**_remembered(resume), **mine}
         arguments["out"] = None  # a resumed run stays in its own folder
         result, out = distill(**arguments), resume
@@ -181,6 +185,12 @@ COMMANDS: dict[str, Callable[..., None]] = {
         },
         {
             "out": (Path, Path("runs/latest"), "Folder of the run."),
+            "device": (
+                OptionalText,
+                None,
+                'Where the student is trained: "cpu" (as without it), "cuda", "cuda:N"; beside '
+                "--resume, where it goes on.",
+            ),
             "compare": (bool, False, "Also clone plainly, without probes, and show both."),
         },
     ),

@@ -1,5 +1,6 @@
 """How torch computes on this machine: threads, matrix products and the device."""
 
+import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -12,6 +13,7 @@ __all__ = ["pick_device", "torch_settings"]
 # "medium" sends float32 products through oneDNN, twice as fast on AMD CPUs as the default and
 # as exact there; a chip with bfloat16 matrix units may round for real, which this bound catches.
 _ACCEPTED_ERROR = 2e-6
+_FULL = re.compile("CUDA.*out of memory|CUBLAS_STATUS_ALLOC_FAILED")
 
 
 def pick_device(device: str) -> torch.device:
@@ -70,11 +72,15 @@ def torch_settings(device: torch.device, threads: int = 1) -> Iterator[str]:
         if _product_error(device) > _ACCEPTED_ERROR:
             torch.set_float32_matmul_precision(before_precision)
         yield torch.get_float32_matmul_precision()
-    except torch.OutOfMemoryError as error:
+    except RuntimeError as error:
+        # Without room for CUDA itself, or for its libraries, the error is of another class.
+        if not _FULL.search(str(error)):
+            raise
+        said = str(error).removeprefix("CUDA out of memory. ").partition(". ")[0]
         raise FitError(
-            f"no GPU memory left: {str(error).partition('. ')[0]}",
+            f"no GPU memory left: {said.splitlines()[0]}",
             "room for all demonstrations, the answers around them and a training step",
-            'end what else uses the GPU, or write device="cpu"',
+            'end what else uses the GPU, or compute on the CPU: device="cpu"',
         ) from error
     finally:
         torch.set_float32_matmul_precision(before_precision)

@@ -191,8 +191,7 @@ def fit(
         loss = taylor_loss(student, batch, stencil, weights)
         return torch.stack([loss.total, loss.action, loss.derivative, loss.curvature])
 
-    clipped = settings.max_gradient_norm
-    step = gradient_step(student, optimiser, loss_of, clipped, device)
+    step = gradient_step(student, optimiser, loss_of, settings.max_gradient_norm, device)
     first_epoch = state.step // per_epoch
     dealt = _deal(batches, training, per_epoch, first_epoch)
     student.train()

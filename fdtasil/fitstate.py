@@ -71,7 +71,7 @@ class FitState:
 
     def _finite_weights(self) -> bool:
         parts = [torch.isfinite(weights).all() for weights in self._student.parameters()]
-        return not parts or bool(torch.stack(parts).all())
+        return bool(torch.stack(parts).all())
 
     def log(self, held_out: float | None) -> dict[str, float]:
         """Make an entry of the steps since the last one, and keep the weights if they are best.

@@ -101,7 +101,7 @@ def distill(
         episodes: Number of demonstrations; those given say it themselves.
         horizon: Steps after which an episode is cut; default: the environment's time limit.
         seed: Equal seeds give equal bytes, on one machine with the same versions.
-        device: Where the student is trained: "cpu", "cuda".
+        device: Where the student is trained: "cpu", "cuda", "cuda:N".
         demonstrations: Train from these instead of recording: a run folder, its
             demonstrations.npz, or a `Dataset`. Stored answers to probes are used as they are.
         order: 1, or 2 to match second differences too (central stencil, or "jacobian").
@@ -131,7 +131,8 @@ def distill(
         force: Go on with a warning where the expert fails the gate but answers.
         out: Folder of the run: checkpoints while it goes on, then all its files.
         resume: Folder of a run that was interrupted; it goes on from its last checkpoint and ends
-            with the bytes of a run that never was.
+            with the bytes of a run that never was. `max_queries` may be another; so may versions
+            and `device`, with a warning that bytes may differ.
         log_formats: Some of stdout, log, csv, json, tensorboard: stable-baselines3's logger, into
             the folder `log` of the run.
         callback: Told of each 100 training steps, each round and the evaluation; see `Event`.
@@ -144,7 +145,7 @@ def distill(
         SettingError: If an argument can't be used.
         ExpertError: If the expert can't be opened or fails the gate, before anything is trained.
         EnvironmentFault: If the environment can't be used, or misbehaves.
-        FitError: If training diverges.
+        FitError: If training diverges, or the GPU has no memory left.
         StorageError: If the run's folder can't be written.
 
     Example:

@@ -37,8 +37,9 @@ def open_run_folder(
         resume: Whether the folder holds this run's beginning.
 
     Raises:
-        SettingError: If there is nothing to resume, the folder's run has another configuration,
-            or a new run would overwrite an unfinished one.
+        SettingError: If there is nothing to resume, the folder's run has another configuration
+            (other versions and another device are warned of), or a new run would overwrite an
+            unfinished one.
         StorageError: If the folder can't be written, or another process writes it.
     """
     folder = RunFolder(path, config)
@@ -49,7 +50,7 @@ def open_run_folder(
     going_on = f'go on with resume="{path}" (--resume {path})'
     with locked(path):
         if before is not None:
-            _check_same(before, config, path)
+            _check_same(before, config, path, finished=folder.finished)
         elif folder.begun:
             raise SettingError(
                 f"{path} holds an unfinished run",
@@ -149,7 +150,9 @@ def _read_config(path: Path) -> dict[str, Any]:
         ) from error
 
 
-def _check_same(before: dict[str, Any], now: dict[str, Any], path: Path) -> None:
+def _check_same(
+    before: dict[str, Any], now: dict[str, Any], path: Path, *, finished: bool
+) -> None:
     changed = _differences({**before, _FREE: None}, {**now, _FREE: None})
     surroundings = [change for change in changed if change.startswith(("versions.", "device "))]
     settings = [change for change in changed if change not in surroundings]
@@ -160,7 +163,7 @@ def _check_same(before: dict[str, Any], now: dict[str, Any], path: Path) -> None
             "the same arguments as at the beginning",
             "repeat them, or start anew in another folder",
         )
-    if surroundings:
+    if surroundings and not finished:
         found = "; ".join(surroundings)
         message = f"resumed with other versions or on another device, so bytes may differ: {found}"
         warnings.warn(message, FdtasilWarning, stacklevel=4)

@@ -17,6 +17,7 @@ __all__ = [
     "ExpertPath",
     "OptionalEnvironment",
     "OptionalExpert",
+    "OptionalText",
     "PolicyPath",
     "as_command",
     "import_module_of",
@@ -24,6 +25,7 @@ __all__ = [
 
 OptionalExpert = Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="EXPERT")]
 OptionalEnvironment = Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="ENV")]
+OptionalText = Annotated[str | None, tyro.conf.arg(metavar="TEXT")]
 PolicyPath = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="POLICY")]
 AgentPath = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="AGENT.zip")]
 ExpertPath = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="EXPERT")]

@@ -13,8 +13,9 @@ __all__ = ["Step", "gradient_step"]
 Step = Callable[[Minibatch, float], Tensor]
 """Takes a step on a minibatch at a learning rate, and returns its losses."""
 
-_EAGER = 3  # steps before the first recording: they make what a recording must find
-_TENSORS = ("observations", "actions", "displacements", "values")
+# Steps before the first recording, on its stream: AdamW's moments and cuBLAS's workspace must be
+# there, for what is made while recording belongs to that one recording.
+_EAGER = 3
 
 
 def gradient_step(
@@ -77,7 +78,7 @@ class _Replayed:
         if self._eager:
             self._eager -= 1
             return self._aside(batch)
-        key = batch.gain, *(tensor.shape for tensor in _tensors(batch).values())
+        key = batch.gain, *((name, tensor.shape) for name, tensor in _tensors(batch).items())
         if key not in self._recordings:
             self._recordings[key] = self._record(batch)
         recording = self._recordings[key]
@@ -89,20 +90,21 @@ class _Replayed:
 
     def _aside(self, batch: Minibatch) -> Tensor:
         """Take the step on the recordings' stream: gradients belong to the one they began on."""
-        self._stream.wait_stream(torch.cuda.current_stream())
+        usual = torch.cuda.current_stream(self._stream.device)
+        self._stream.wait_stream(usual)
         with torch.cuda.stream(self._stream):
             losses = self._step(batch, self._rate)
-        torch.cuda.current_stream().wait_stream(self._stream)
+        usual.wait_stream(self._stream)
         return losses
 
     def _record(self, batch: Minibatch) -> _Recording:
         copies = {name: tensor.clone() for name, tensor in _tensors(batch).items()}
         inputs, graph = replace(batch, **copies), torch.cuda.CUDAGraph()
+        # What other threads of the caller do with the GPU meanwhile is none of the recording's.
         with torch.cuda.graph(graph, stream=self._stream, capture_error_mode="thread_local"):
             losses = self._step(inputs, self._rate)
         return _Recording(graph, inputs, losses)
 
 
 def _tensors(batch: Minibatch) -> dict[str, Tensor]:
-    found = ((name, getattr(batch, name)) for name in _TENSORS)
-    return {name: tensor for name, tensor in found if tensor is not None}
+    return {name: value for name, value in vars(batch).items() if isinstance(value, Tensor)}

@@ -21,7 +21,7 @@ ROOT = Path(__file__).parent.parent
 def double(cell, device):
     if cell["number"] == 3:
         raise ValueError("three is refused")
-    return {"double": 2 * cell["number"]}
+    return {"double": 2 * cell["number"], "device": device}
 
 
 TOY = Benchmark("toy", "Doubles.", lambda quick: [], double, lambda rows: {})
@@ -40,6 +40,7 @@ def test_a_failed_cell_is_kept_and_does_not_stop_the_others(workers, tmp_path):
     assert failed["cell"]["number"] == 3
     assert "three is refused" in failed["error"]
     assert doubles(path) == {0: 0, 1: 2, 2: 4, 4: 8}
+    assert {row["result"]["device"] for row in results_of(read_rows(path))} == {"cpu"}
     for row in read_rows(path):
         assert row.keys() >= {"versions", "machine", "seconds", "commit"}
 
@@ -92,6 +93,14 @@ def test_what_is_done_is_skipped_and_a_cut_line_is_done_again(tmp_path):
     assert path.read_text() == before
 
 
+def test_cells_learn_on_which_device_to_train_and_rows_name_it(tmp_path, monkeypatch):
+    monkeypatch.setattr("torch.cuda.get_device_name", lambda device: f"the GPU of {device}")
+    run(TOY, CELLS[:2], tmp_path / "toy.jsonl", device="cuda")
+    for row in read_rows(tmp_path / "toy.jsonl"):
+        assert row["result"]["device"] == "cuda"
+        assert row["machine"].endswith(", the GPU of cuda")
+
+
 def test_statistics_on_known_samples():
     assert interquartile_mean([0, 1, 1, 100]) == 1
     low, high = interval(list(np.random.default_rng(0).normal(size=200)))
@@ -114,6 +123,14 @@ def test_the_shell(tmp_path):
     empty = shell("draw", "quality", "--results", str(tmp_path), "--out", str(tmp_path))
     assert empty.returncode == 1
     assert "run it first" in empty.stderr
+    for arguments, said in {
+        ("mujoco", "--device", "tpu"): "device='tpu'",
+        ("mujoco", "--device", "cuda", "--backend", "ray"): "beside --backend ray",
+        ("speed", "--device", "cuda"): "speed says itself",
+    }.items():
+        wrong = shell("run", *arguments, "--out", str(tmp_path))
+        assert wrong.returncode == 2
+        assert said in wrong.stderr
 
 
 def test_the_quality_table_pairs_equal_seeds(tmp_path):

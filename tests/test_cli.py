@@ -42,7 +42,8 @@ def test_the_shell_has_the_functions_arguments_and_defaults(name):
     assert set(command) - set(function) <= {"out", "compare"}
     for argument in set(function) & set(command):
         default = function[argument].default
-        if argument != "out":  # a shell's run is always saved
+        # A shell's run is always saved; one that goes on stays on its device.
+        if argument not in ("out", "device"):
             assert command[argument].default in (default, str(default))
 
 
@@ -119,6 +120,15 @@ def test_a_run_goes_on_as_it_was_begun_and_a_failed_call_changes_nothing(tmp_pat
     assert "--seed beside --resume" in other.stderr
     replacing = shell("distill", expert, TOY, *QUICK, "--seed", 1, "--out", tmp_path / "run")
     assert "which this one replaces" in replacing.stderr
+
+
+def test_a_run_goes_on_where_it_was_begun_or_where_it_is_told_to(tmp_path):
+    begun = {"expert": "e.onnx", "env": "Pendulum-v1", "trust": None, "device": "tpu"}
+    (tmp_path / "command.json").write_text(json.dumps(begun))
+    for arguments, found in {(): "device='tpu'", ("--device", "npu"): "device='npu'"}.items():
+        refused = shell("distill", "--resume", tmp_path, *arguments)
+        assert refused.returncode == 1
+        assert found in refused.stderr
 
 
 def test_a_module_of_the_current_folder_and_a_warning_without_source(tmp_path):

@@ -58,6 +58,21 @@ def test_equal_seeds_give_equal_weights_also_when_resumed(spec):
     assert rest == history
 
 
+@pytest.mark.parametrize("devices", [("cuda", "cpu"), ("cpu", "cuda")])
+def test_a_training_goes_on_elsewhere(devices):
+    kept = {}
+
+    def keep(state):
+        if state.step == 150:
+            kept["state"] = state.to_bytes()
+
+    whole, _ = train("4", devices[0], checkpoint=keep)
+    moved, history = train("4", devices[1], resume=kept["state"])
+    assert [entry["step"] for entry in history] == [100, 200, 300]
+    rows = np.random.default_rng(1).standard_normal((50, 6)).astype(np.float32)
+    assert np.abs(whole.act(rows) - moved.act(rows)).max() < 0.05
+
+
 @pytest.mark.parametrize("spec", [None, "4"])
 def test_a_step_waits_for_nothing(spec):
     """The loss is read once in a hundred steps; set-up and recording apart, nothing else is."""
@@ -92,14 +107,14 @@ def stepwise(launched):
 def minibatches():
     random = torch.Generator().manual_seed(0)
     for number in range(20):
-        rows = 10 + number % 2
+        rows = 10 + (number > 9)  # the second shape comes up when the first is recorded
         draws = (torch.randn(rows, size, generator=random).to("cuda") for size in (6, 2))
-        yield Minibatch(*draws)
+        yield Minibatch(*draws, gain=1.0 + (number > 14))
 
 
 def loss_of(student, batch):
     error = (student(batch.observations) - batch.actions).norm(dim=1).mean()
-    return torch.stack([error] * 4)
+    return batch.gain * torch.stack([error] * 4)
 
 
 class Expert(torch.nn.Module):
