@@ -127,7 +127,7 @@ def test_a_run_goes_on_where_it_was_begun_or_where_it_is_told_to(tmp_path):
     (tmp_path / "command.json").write_text(json.dumps(begun))
     for arguments, found in {(): "device='tpu'", ("--device", "npu"): "device='npu'"}.items():
         refused = shell("distill", "--resume", tmp_path, *arguments)
-        assert refused.returncode == 1
+        assert refused.returncode == 2
         assert found in refused.stderr
 
 
