@@ -15,6 +15,7 @@ from benchmarks.runner import (
     FIGURES,
     RESULTS,
     Benchmark,
+    due_cells,
     known_results,
     provenance,
     read_rows,
@@ -111,8 +112,9 @@ def _check_device(
 
 def _list() -> int:
     for name, benchmark in BENCHMARKS.items():
-        done = len(results_of(read_rows(benchmark.results(RESULTS))))
-        print(f"{name:20}{done:5} of {len(benchmark.cells(False)):5} cells  {benchmark.about}")
+        cells = benchmark.cells(False)  # of the experts that are here
+        done = len(cells) - len(due_cells(cells, benchmark.results(RESULTS)))
+        print(f"{name:20}{done:5} of {len(cells):5} cells  {benchmark.about}")
     return 0
 
 

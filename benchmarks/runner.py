@@ -24,6 +24,7 @@ __all__ = [
     "Benchmark",
     "Cell",
     "Row",
+    "due_cells",
     "known_results",
     "provenance",
     "read_rows",
@@ -97,8 +98,7 @@ def run(
     Returns:
         The rows of those cells that failed now.
     """
-    done = {_key(row["cell"]) for row in read_rows(path) if "result" in row}
-    due = [cell for cell in cells if _key(cell) not in done]
+    due = due_cells(cells, path)
     path.parent.mkdir(parents=True, exist_ok=True)
     if path.exists() and not path.read_text().endswith("\n"):
         with path.open("a") as file:
@@ -121,6 +121,12 @@ def run(
                 failed.append(row)
                 tqdm.write(f"FAILED {json.dumps(row['cell'])}\n{row['error']}", file=sys.stderr)
     return failed
+
+
+def due_cells(cells: Sequence[Cell], path: Path) -> list[Cell]:
+    """Return those cells that have no result in a results file."""
+    done = {_key(row["cell"]) for row in read_rows(path) if "result" in row}
+    return [cell for cell in cells if _key(cell) not in done]
 
 
 def known_results(benchmarks: Iterable[Benchmark], folder: Path) -> dict[str, Row]:
