@@ -13,9 +13,10 @@ from typing import Any
 import tyro
 
 from fdtasil.account import rows_text
+from fdtasil.beside import evaluated_beside
 from fdtasil.distilled import Distilled
 from fdtasil.errors import FdtasilError, FdtasilWarning, SettingError
-from fdtasil.evaluation import interval_text, score_text
+from fdtasil.evaluation import Evaluation, interval_text, score_text
 from fdtasil.inspection import inspect_expert
 from fdtasil.lock import locked
 from fdtasil.pipeline import distill, evaluate
@@ -44,19 +45,20 @@ def _distill(compare: bool, **arguments: Any) -> None:
     if arguments["device"] is None:
         del arguments["device"]  # the library's own, or the one that the run was begun on
     import_module_of(arguments["env"])
-    if resume is None:
-        with _remembering(arguments):
-            result, out = distill(**arguments), arguments["out"]
-    else:
-        if arguments["expert"] is None and arguments["env"] is None:
-            _check_alone(arguments)
-            mine = {name: arguments.get(name) for name in _BESIDE}
-            mine = {name: value for name, value in mine.items() if value is not None}
-            arguments = {**_remembered(resume), **mine}
-        arguments["out"] = None  # a resumed run stays in its own folder
-        result, out = distill(**arguments), resume
+    if resume is not None and arguments["expert"] is None and arguments["env"] is None:
+        _check_alone(arguments)
+        mine = {name: arguments.get(name) for name in _BESIDE}
+        mine = {name: value for name, value in mine.items() if value is not None}
+        arguments = {**_remembered(resume), **mine}
+    out = arguments["out"] if resume is None else resume
     plainly = {**arguments, "probes": 0, "out": None, "resume": None, "log_formats": ()}
-    print(_side_by_side(result, distill(**plainly) if compare else None))
+    with evaluated_beside(plainly if compare else None) as cloning:
+        if resume is None:
+            with _remembering(arguments):
+                result = distill(**arguments)
+        else:
+            result = distill(**{**arguments, "out": None})  # it stays in its own folder
+        print(_side_by_side(result, cloning()))
     print(f"rows asked of the expert: {rows_text(result.queries)}")
     print(f"saved in {out}: student.onnx, student.safetensors, report.json, figures/, ...")
 
@@ -148,7 +150,7 @@ def _evaluate(**arguments: Any) -> None:
     print(evaluate(**arguments))
 
 
-def _side_by_side(result: Distilled, cloning: Distilled | None) -> str:
+def _side_by_side(result: Distilled, cloning: Evaluation | None) -> str:
     """Return a table of expert, plain cloning and student."""
     ours = result.evaluation
     if ours is None:
@@ -158,10 +160,8 @@ def _side_by_side(result: Distilled, cloning: Distilled | None) -> str:
         f"{'':15}{'return':>10}{'normalised':>12}{'95 % interval':>18}{'survival':>10}",
         f"{'expert':15}{ours.expert_return:10.1f}{1:12.3f}{'':18}{ours.expert_survival:10.2f}",
     ]
-    students = {"plain cloning": cloning, "student": result}
-    for name, one in students.items():
-        if one is not None and one.evaluation is not None:
-            e = one.evaluation
+    for name, e in {"plain cloning": cloning, "student": ours}.items():
+        if e is not None:
             lines.append(
                 f"{name:15}{e.student_return:10.1f}{score_text(e.normalized_return):>12}"
                 f"{interval_text(e.ci95):>18}{e.survival:10.2f}"
@@ -191,7 +191,11 @@ COMMANDS: dict[str, Callable[..., None]] = {
                 'Where the student is trained: "cpu" (as without it), "cuda", "cuda:N"; beside '
                 "--resume, where it goes on.",
             ),
-            "compare": (bool, False, "Also clone plainly, without probes, and show both."),
+            "compare": (
+                bool,
+                False,
+                "Also clone plainly, without probes, in a process beside it, and show both.",
+            ),
         },
     ),
     "export-sb3": as_command(

@@ -11,6 +11,7 @@ import fdtasil
 ORDER = [
     "cli",
     "inspection",
+    "beside",
     "shell",
     "testing",
     "pipeline",
