@@ -1,0 +1,105 @@
+"""The cloning beside a run: its outcome comes back, and no process is left."""
+
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+from conftest import QUICK, TOY, mlp_onnx
+
+import fdtasil
+from fdtasil.beside import evaluated_beside
+from fdtasil.errors import ExpertError, FitError
+
+ENDLESS = {**QUICK, "steps": 10**7}
+
+
+@pytest.fixture
+def run(tmp_path, monkeypatch):
+    """Arguments of a quick cloning; its process finds the toy environments, and modules here."""
+    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))
+    monkeypatch.chdir(tmp_path)
+    return {"expert": str(mlp_onnx(tmp_path / "e.onnx")), "env": TOY, "probes": 0, **QUICK}
+
+
+@pytest.fixture
+def started(monkeypatch):
+    """The processes that were begun."""
+    found = []
+
+    class Noted(subprocess.Popen):
+        def __init__(self, *arguments, **named):
+            super().__init__(*arguments, **named)
+            found.append(self)
+
+    monkeypatch.setattr("fdtasil.beside.subprocess.Popen", Noted)
+    return found
+
+
+def test_the_evaluation_is_that_of_the_same_call(run, tmp_path):
+    """Whatever the environment prints."""
+    loud = "import toy_environments\nprint('much ' * 99)\nimport os\nos.write(1, b'noise')\n"
+    (tmp_path / "loud.py").write_text(loud)
+    with evaluated_beside({**run, "env": "loud:toy/Integrator-v0"}) as cloning:
+        expected = fdtasil.distill(**run, progress=False).evaluation
+        assert cloning() == expected
+
+
+def test_nothing_is_begun_where_nothing_is_compared(started):
+    with evaluated_beside(None) as cloning:
+        assert cloning() is None
+    assert started == []
+
+
+def test_what_the_distillation_raises_comes_back(run):
+    refused = pytest.raises(ExpertError, match=r"none\.onnx can't be read")
+    with evaluated_beside({**run, "expert": "none.onnx"}) as cloning, refused:
+        cloning()
+
+
+def test_a_process_that_ends_by_itself_is_named(run, tmp_path):
+    (tmp_path / "gone.py").write_text("import os, sys\nsys.stderr.write('bye')\nos._exit(3)\n")
+    refused = pytest.raises(FitError, match=r"ended with code 3: .*bye")
+    with evaluated_beside({**run, "env": "gone:Gone-v0"}) as cloning, refused as error:
+        cloning()
+    assert len(str(error.value).splitlines()) <= 6
+
+
+def test_it_ends_with_the_block(run, started):
+    with pytest.raises(KeyboardInterrupt), evaluated_beside({**run, **ENDLESS}):
+        raise KeyboardInterrupt
+    (process,) = started
+    assert process.returncode == -signal.SIGKILL
+
+
+def test_it_ends_with_a_parent_that_is_killed(run, tmp_path):
+    script = f"""
+import fdtasil.beside as beside
+Popen = beside.subprocess.Popen
+def noted(*arguments, **named):
+    process = Popen(*arguments, **named)
+    print(process.pid, flush=True)
+    return process
+beside.subprocess.Popen = noted
+with beside.evaluated_beside({ {**run, **ENDLESS}!r}) as cloning:
+    cloning()
+"""
+    parent = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE)
+    with parent:
+        pid = int(parent.stdout.readline())
+        time.sleep(4)  # until it has read its arguments
+        assert _runs(pid)
+        parent.kill()
+    deadline = time.monotonic() + 20
+    while _runs(pid) and time.monotonic() < deadline:
+        time.sleep(0.2)
+    assert not _runs(pid)
+
+
+def _runs(pid):
+    try:
+        return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()[0] != "Z"
+    except FileNotFoundError:
+        return False
