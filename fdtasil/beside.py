@@ -18,6 +18,9 @@ from fdtasil.shell import import_module_of
 
 __all__ = ["evaluated_beside"]
 
+# Modules come from where they come from here: -m would look into the current folder first, and run
+# what somebody else left there.
+_BEGIN = "import sys; sys.path[:] = sys.argv[1:]; from fdtasil.beside import _main; _main()"
 _Outcome = Evaluation | FdtasilError | None
 
 
@@ -38,7 +41,7 @@ def evaluated_beside(
     if arguments is None:
         yield lambda: None
         return
-    command, pipe = [sys.executable, "-m", "fdtasil.beside"], subprocess.PIPE
+    command, pipe = [sys.executable, "-P", "-c", _BEGIN, *sys.path], subprocess.PIPE
     with (
         TemporaryFile() as said,
         subprocess.Popen(command, bufsize=0, stdin=pipe, stdout=pipe, stderr=said) as process,
@@ -91,7 +94,3 @@ def _main() -> None:
 def _end_with_the_parent() -> None:
     sys.stdin.buffer.read()  # ends when the other side is closed, by whatever
     os._exit(1)
-
-
-if __name__ == "__main__":
-    _main()

@@ -1,5 +1,6 @@
 """The cloning beside a run: its outcome comes back, and no process is left."""
 
+import os
 import signal
 import subprocess
 import sys
@@ -18,9 +19,9 @@ ENDLESS = {**QUICK, "steps": 10**7}
 
 @pytest.fixture
 def run(tmp_path, monkeypatch):
-    """Arguments of a quick cloning; its process finds the toy environments, and modules here."""
-    monkeypatch.setenv("PYTHONPATH", str(Path(__file__).parent))
+    """Arguments of a quick cloning, from a folder with a file that nobody may import."""
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "safetensors.py").write_text("raise SystemExit(9)\n")
     return {"expert": str(mlp_onnx(tmp_path / "e.onnx")), "env": TOY, "probes": 0, **QUICK}
 
 
@@ -86,7 +87,9 @@ beside.subprocess.Popen = noted
 with beside.evaluated_beside({ {**run, **ENDLESS}!r}) as cloning:
     cloning()
 """
-    parent = subprocess.Popen([sys.executable, "-c", script], stdout=subprocess.PIPE)
+    paths = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
+    command = [sys.executable, "-P", "-c", script]
+    parent = subprocess.Popen(command, stdout=subprocess.PIPE, env=paths)
     with parent:
         pid = int(parent.stdout.readline())
         time.sleep(4)  # until it has read its arguments
