@@ -1,18 +1,17 @@
 """The plain cloning that a run is compared with, in a process of its own beside it."""
 
-import os
 import pickle
 import subprocess
 import sys
-import threading
 import warnings
 from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from tempfile import TemporaryFile
 from typing import IO, Any
 
 from fdtasil.errors import FdtasilError, FitError
 from fdtasil.evaluation import Evaluation
+from fdtasil.experts.worker_process import connect, receive, send
 from fdtasil.pipeline import distill
 from fdtasil.shell import import_module_of
 
@@ -44,12 +43,11 @@ def evaluated_beside(
     command, pipe = [sys.executable, "-P", "-c", _BEGIN, *sys.path], subprocess.PIPE
     with (
         TemporaryFile() as said,
-        subprocess.Popen(command, bufsize=0, stdin=pipe, stdout=pipe, stderr=said) as process,
+        subprocess.Popen(command, stdin=pipe, stdout=pipe, stderr=said) as process,
     ):
         try:
             assert process.stdin is not None
-            with suppress(BrokenPipeError):  # it ended already; asking for its outcome says how
-                process.stdin.write(pickle.dumps(dict(arguments)))
+            send(process.stdin, dict(arguments))
             yield lambda: _outcome(process, said)
         finally:
             process.kill()
@@ -57,8 +55,9 @@ def evaluated_beside(
 
 def _outcome(process: "subprocess.Popen[bytes]", said: IO[bytes]) -> Evaluation | None:
     assert process.stdout is not None
-    data = process.stdout.read()
-    if not data:
+    try:
+        outcome: _Outcome = pickle.loads(receive(process.stdout))
+    except EOFError:
         code = process.wait()
         said.seek(0)
         last = said.read().decode(errors="replace").strip().rpartition("\n")[2]
@@ -66,20 +65,16 @@ def _outcome(process: "subprocess.Popen[bytes]", said: IO[bytes]) -> Evaluation 
             f"the plain cloning ended with code {code}: {last or 'it said nothing'}",
             "an evaluation to compare with",
             "run it alone with --probes 0; the run beside it is saved",
-        )
-    outcome: _Outcome = pickle.loads(data)
+        ) from None
     if isinstance(outcome, FdtasilError):
         raise outcome
     return outcome
 
 
 def _main() -> None:
-    """Read the arguments from standard input, and write the outcome to standard output."""
-    arguments = pickle.load(sys.stdin.buffer)
-    threading.Thread(target=_end_with_the_parent, daemon=True).start()
-    # What an environment prints must not get into the outcome.
-    results = os.fdopen(os.dup(1), "wb")
-    os.dup2(2, 1)
+    """Take the arguments from the parent, and reply with the outcome."""
+    inbox, replies = connect()
+    arguments = pickle.loads(inbox.get())
     outcome: _Outcome
     try:
         with warnings.catch_warnings(action="ignore"):  # the run beside it warns of the same
@@ -87,10 +82,4 @@ def _main() -> None:
             outcome = distill(**arguments, progress=False).evaluation
     except FdtasilError as error:
         outcome = error
-    with results:
-        pickle.dump(outcome, results)
-
-
-def _end_with_the_parent() -> None:
-    sys.stdin.buffer.read()  # ends when the other side is closed, by whatever
-    os._exit(1)
+    send(replies, outcome)

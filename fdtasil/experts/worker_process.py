@@ -17,7 +17,7 @@ import traceback
 from collections.abc import Callable
 from typing import IO, Any
 
-__all__ = ["as_array", "receive", "send"]
+__all__ = ["as_array", "connect", "receive", "send"]
 
 _LENGTH = struct.Struct("<Q")
 _PARENT_DEATH = 1  # PR_SET_PDEATHSIG
@@ -70,12 +70,20 @@ def as_array(answer: Any) -> Any:
 
 def main() -> None:
     """Answer batches until the parent closes the pipe, or is no more."""
+    _serve(*connect())
+
+
+def connect() -> tuple["queue.SimpleQueue[bytes]", IO[bytes]]:
+    """Return where the parent's messages come in, still pickled, and where replies go out.
+
+    From here on this process ends with its parent, and what it prints goes to standard error.
+    """
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the parent's to answer
     _die_with_the_parent()
     requests, replies = _private_streams()
     inbox: queue.SimpleQueue[bytes] = queue.SimpleQueue()
     threading.Thread(target=_read, args=(requests, inbox), daemon=True).start()
-    _serve(inbox, replies)
+    return inbox, replies
 
 
 def _die_with_the_parent() -> None:
