@@ -28,7 +28,7 @@ from benchmarks.trainers import MUJOCO
 from benchmarks.training_length import TRAINING_LENGTH
 from fdtasil.compute import pick_device
 from fdtasil.errors import SettingError
-from fdtasil.storage import write_bytes
+from fdtasil.files.storage import write_bytes
 
 BENCHMARKS: dict[str, Benchmark] = {
     benchmark.name: benchmark

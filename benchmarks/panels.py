@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from benchmarks.statistics import interquartile_mean, interval
-from fdtasil.figures import png_of
+from fdtasil.results.figures import png_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -17,7 +17,7 @@ import torch
 from joblib import Parallel, delayed, parallel_config
 from tqdm import tqdm
 
-from fdtasil.report import versions
+from fdtasil.run.report import versions
 
 __all__ = [
     "BACKENDS",

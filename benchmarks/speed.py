@@ -14,19 +14,19 @@ import torch
 from benchmarks.controllers import CONTROLLERS, available
 from benchmarks.runner import Benchmark, Cell, Row
 from benchmarks.tables import table
-from fdtasil.answers import ask_probes
-from fdtasil.behaviours import follow
 from fdtasil.compute import torch_settings
-from fdtasil.demonstrations import Demonstrations
-from fdtasil.environments import EnvironmentPool
-from fdtasil.experts import load_expert
-from fdtasil.fit import fit
-from fdtasil.presets import PRESETS
-from fdtasil.probes import Probes
-from fdtasil.rollouts import rollout
-from fdtasil.scales import statistics as scales_of
+from fdtasil.demonstrations.states import Demonstrations
+from fdtasil.experts.load import load_expert
+from fdtasil.probes.answers import ask_probes
+from fdtasil.probes.scales import measure_scales as scales_of
+from fdtasil.probes.source import Probes
+from fdtasil.rollouts.behaviours import follow
+from fdtasil.rollouts.environments import EnvironmentPool
+from fdtasil.rollouts.rollout import rollout
+from fdtasil.run.presets import PRESETS
 from fdtasil.seeding import torch_generator
-from fdtasil.student import Student, StudentShape
+from fdtasil.student.fit import fit
+from fdtasil.student.network import Student, StudentShape
 
 __all__ = ["SPEED"]
 

@@ -17,7 +17,7 @@ from benchmarks.synthetic_system import (
     as_function,
     make_expert,
 )
-from fdtasil.behaviours import Policy
+from fdtasil.rollouts.behaviours import Policy
 from fdtasil.seeding import generator
 
 __all__ = ["STABILITY", "follow_student"]

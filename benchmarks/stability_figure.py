@@ -8,7 +8,7 @@ import numpy as np
 from benchmarks.runner import Row
 from benchmarks.stability_table import NAMES, STARTS, THRESHOLDS, Results, grouped
 from benchmarks.statistics import interval
-from fdtasil.figures import png_of
+from fdtasil.results.figures import png_of
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -15,10 +15,10 @@ from pathlib import Path
 
 import torch
 
-from fdtasil.behaviours import follow
-from fdtasil.environments import EnvironmentPool
-from fdtasil.experts import load_expert
-from fdtasil.rollouts import rollout
+from fdtasil.experts.load import load_expert
+from fdtasil.rollouts.behaviours import follow
+from fdtasil.rollouts.environments import EnvironmentPool
+from fdtasil.rollouts.rollout import rollout
 from fdtasil.seeding import episode_seeds
 
 HERE = Path(__file__).parent

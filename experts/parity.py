@@ -31,8 +31,10 @@ from stable_baselines3.common.env_util import make_vec_env
 from stable_baselines3.common.vec_env import VecEnv, VecNormalize
 
 from fdtasil.errors import ExpertError
-from fdtasil.onnx_files import open_session, read_model, run_session
-from fdtasil.sb3 import export_sb3, read_agent
+from fdtasil.experts.sb3.agent import read_agent
+from fdtasil.experts.sb3.export import export_sb3
+from fdtasil.files.onnx.model import read_model
+from fdtasil.files.onnx.session import open_session, run_session
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests"))
 from sb3_agents import LAYOUTS, OFF_POLICY, algorithm_class, booby_trap, old_layout, shake

@@ -17,13 +17,13 @@ import torch
 from actor import load_actor
 from measure import EPISODES, HERE, HORIZONS, MANIFEST, measure
 
-from fdtasil.behaviours import follow
-from fdtasil.environments import EnvironmentPool
-from fdtasil.onnx_files import export_module
-from fdtasil.rollouts import rollout
-from fdtasil.sb3 import read_agent
+from fdtasil.experts.sb3.agent import read_agent
+from fdtasil.files.onnx.export import export_module
+from fdtasil.files.storage import sha256, write_bytes
+from fdtasil.rollouts.behaviours import follow
+from fdtasil.rollouts.environments import EnvironmentPool
+from fdtasil.rollouts.rollout import rollout
 from fdtasil.seeding import episode_seeds
-from fdtasil.storage import sha256, write_bytes
 
 
 class ActorModule(torch.nn.Module):

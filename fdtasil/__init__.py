@@ -7,17 +7,18 @@ print(result.evaluation)
 result.to_onnx("student.onnx")
 """
 
-from fdtasil.datasets import Dataset
-from fdtasil.distilled import Distilled
+from fdtasil.demonstrations.dataset import Dataset
+from fdtasil.demonstrations.minari_data import from_minari, to_minari
+from fdtasil.demonstrations.trainers import DAgger, Dart
 from fdtasil.errors import FdtasilError, FdtasilWarning
-from fdtasil.evaluation import Evaluation
-from fdtasil.events import Event
-from fdtasil.experts import Expert, load_expert
-from fdtasil.minari_data import from_minari, to_minari
-from fdtasil.pipeline import distill, evaluate
-from fdtasil.probes import Probes
-from fdtasil.student import Student
-from fdtasil.trainers import DAgger, Dart
+from fdtasil.experts.expert import Expert
+from fdtasil.experts.load import load_expert
+from fdtasil.probes.source import Probes
+from fdtasil.results.distilled import Distilled
+from fdtasil.results.evaluation import Evaluation
+from fdtasil.run.events import Event
+from fdtasil.run.pipeline import distill, evaluate
+from fdtasil.student.network import Student
 
 __version__ = "0.1.0"
 

@@ -1,5 +1,5 @@
 """`python -m fdtasil` is the command line."""
 
-from fdtasil.cli import main
+from fdtasil.shell.main import main
 
 main()

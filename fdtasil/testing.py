@@ -5,19 +5,20 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fdtasil.behaviours import follow
-from fdtasil.environments import Boxes, EnvironmentLike, EnvironmentPool, resolve_horizon
 from fdtasil.errors import ExpertError, ExportError
-from fdtasil.evaluation import random_behaviour
-from fdtasil.experts import Expert, ExpertLike, Finding, examine_expert, load_expert
-from fdtasil.onnx_files import export_module
-from fdtasil.recording import Episodes
-from fdtasil.rollouts import rollout
-from fdtasil.sb3 import Trust
+from fdtasil.experts.expert import Expert
+from fdtasil.experts.gate import Finding, examine_expert
+from fdtasil.experts.load import ExpertLike, load_expert
+from fdtasil.experts.sb3.trust import Trust
+from fdtasil.files.onnx.export import export_module
+from fdtasil.rollouts.behaviours import follow, random_behaviour
+from fdtasil.rollouts.environments import Boxes, EnvironmentLike, EnvironmentPool, resolve_horizon
+from fdtasil.rollouts.episodes import Episodes
+from fdtasil.rollouts.rollout import rollout
 from fdtasil.seeding import episode_seeds, generator
-from fdtasil.student import Student
+from fdtasil.student.network import Student
 
-__all__ = ["Finding", "check_expert", "check_student"]
+__all__ = ["check_expert", "check_student"]
 
 _STATES, _EPISODES = 32, 3
 _FAR = 1e3

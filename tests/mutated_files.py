@@ -113,7 +113,7 @@ def main(bases: list[Path], first: int, last: int) -> None:
     import torch
 
     import fdtasil
-    from fdtasil import limits
+    from fdtasil.files.onnx import limits
 
     torch.set_num_threads(1)
     limits.CALL_SECONDS = 10.0

@@ -22,7 +22,7 @@ from sb3_agents import Marker, booby_trap, make_agent, rewrite, save_agent
 
 import fdtasil
 from fdtasil.errors import ExpertError, FdtasilError, SettingError
-from fdtasil.student import Student
+from fdtasil.student.network import Student
 
 
 def pickled(protocol, marker):
@@ -187,7 +187,7 @@ def remembered(folder, **changes):
     ],
 )
 def test_a_file_can_not_ask_for_an_import_or_for_trust(changes, found, tmp_path, monkeypatch):
-    from fdtasil.cli import _remembered
+    from fdtasil.shell.main import _remembered
 
     (tmp_path / "attacker.py").write_text("open('marker', 'w').close()")
     monkeypatch.chdir(tmp_path)

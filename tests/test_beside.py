@@ -11,8 +11,8 @@ import pytest
 from conftest import QUICK, TOY, mlp_onnx
 
 import fdtasil
-from fdtasil.beside import evaluated_beside
 from fdtasil.errors import ExpertError, FitError
+from fdtasil.shell.beside import evaluated_beside
 
 ENDLESS = {**QUICK, "steps": 10**7}
 
@@ -35,7 +35,7 @@ def started(monkeypatch):
             super().__init__(*arguments, **named)
             found.append(self)
 
-    monkeypatch.setattr("fdtasil.beside.subprocess.Popen", Noted)
+    monkeypatch.setattr("fdtasil.shell.beside.subprocess.Popen", Noted)
     return found
 
 
@@ -77,7 +77,7 @@ def test_it_ends_with_the_block(run, started):
 
 def test_it_ends_with_a_parent_that_is_killed(run, tmp_path):
     script = f"""
-import fdtasil.beside as beside
+import fdtasil.shell.beside as beside
 Popen = beside.subprocess.Popen
 def noted(*arguments, **named):
     process = Popen(*arguments, **named)

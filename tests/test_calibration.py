@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from conftest import mlp_onnx
 
-from fdtasil.calibration import calibrate
-from fdtasil.experts import load_expert
-from fdtasil.scales import statistics
+from fdtasil.experts.load import load_expert
+from fdtasil.probes.calibration import calibrate
+from fdtasil.probes.scales import measure_scales
 
 STATES = np.random.default_rng(0).standard_normal((200, 5)).astype(np.float32)
 NOISE = np.random.default_rng(1)
@@ -22,7 +22,7 @@ EXPERTS = {
 def test_regimes_are_told_apart(regime, tmp_path):
     clean = load_expert(mlp_onnx(tmp_path / "e.onnx", sizes=(5, 16, 16, 2))).answer
     expert = load_expert(EXPERTS[regime](clean))
-    found = calibrate(expert, STATES, statistics(STATES), np.random.default_rng(0), 0.3)
+    found = calibrate(expert, STATES, measure_scales(STATES), np.random.default_rng(0), 0.3)
     assert found.regime == regime
     assert found.stencil == ("forward" if regime == "smooth" else "central")
     assert found.radius == (0.5 if regime == "steps" else 0.3)

@@ -12,7 +12,7 @@ import torch
 from conftest import TOY, mlp_onnx
 
 import fdtasil
-from fdtasil.cli import COMMANDS
+from fdtasil.shell.main import COMMANDS
 
 QUICK = [
     "--episodes",
@@ -138,7 +138,7 @@ def test_a_module_of_the_current_folder_and_a_warning_without_source(tmp_path):
         "import gymnasium, toy_environments as toys\n"
         "gymnasium.register('My-v0', entry_point=toys.Integrator, max_episode_steps=15)\n"
     )
-    start = "import sys; sys.path.remove(''); from fdtasil.cli import main; main()"
+    start = "import sys; sys.path.remove(''); from fdtasil.shell.main import main; main()"
     command = [sys.executable, "-c", start, "distill", str(expert), "mine:My-v0", *QUICK]
     environment = {**os.environ, "PYTHONPATH": os.path.dirname(__file__)}
     done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=environment)
@@ -156,7 +156,7 @@ def test_no_other_file_of_the_current_folder_is_run(tmp_path):
     expert = mlp_onnx(tmp_path / "e.onnx")
     for name in ("glfw_preview", "cffi", "tensorboard"):
         (tmp_path / f"{name}.py").write_text("print('CODE OF THE FOLDER')")
-    start = "import sys; sys.path.remove(''); from fdtasil.cli import main; main()"
+    start = "import sys; sys.path.remove(''); from fdtasil.shell.main import main; main()"
     command = [sys.executable, "-c", start, "inspect", str(expert), TOY, "--episodes", "1"]
     environment = {**os.environ, "PYTHONPATH": os.path.dirname(__file__)}
     done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=environment)

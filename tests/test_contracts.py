@@ -6,7 +6,7 @@ import torch
 from conftest import TOY, mlp_onnx
 
 import fdtasil
-from fdtasil.trainers import DAgger, Dart
+from fdtasil.demonstrations.trainers import DAgger, Dart
 
 TRAINERS = {
     "bc": "bc",

@@ -19,8 +19,8 @@ from conftest import QUICK, TOY, mlp_onnx
 from test_resume import FILES, Stop, read, stop_at
 
 import fdtasil
-from fdtasil import runfolder
 from fdtasil.errors import FdtasilWarning, StorageError
+from fdtasil.run import folder as runfolder
 
 RUN = {**QUICK, "trainer": "dagger", "probes": "sphere:2,resample", "episodes": 6, "steps": 150}
 SHORT = {**QUICK, "probes": 2, "steps": 3}

@@ -5,9 +5,9 @@ import pytest
 from conftest import QUICK, TOY, mlp_onnx
 
 import fdtasil
-from fdtasil.datasets import Dataset, load_dataset
+from fdtasil.demonstrations.dataset import Dataset, load_dataset
 from fdtasil.errors import SettingError, StorageError
-from fdtasil.views import View
+from fdtasil.student.view import View
 
 
 def never(observations):

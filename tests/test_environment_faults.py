@@ -18,11 +18,11 @@ from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Tu
 from toy_environments import Integrator
 
 import fdtasil
-from fdtasil.behaviours import follow
-from fdtasil.datasets import Dataset
-from fdtasil.environments import EnvironmentPool
+from fdtasil.demonstrations.dataset import Dataset
 from fdtasil.errors import EnvironmentFault, FdtasilWarning, SettingError
-from fdtasil.rollouts import rollout
+from fdtasil.rollouts.behaviours import follow
+from fdtasil.rollouts.environments import EnvironmentPool
+from fdtasil.rollouts.rollout import rollout
 from fdtasil.seeding import episode_seeds
 
 
@@ -65,7 +65,7 @@ def no_training(monkeypatch):
     def never(*arguments, **named):
         raise AssertionError("training began")
 
-    monkeypatch.setattr("fdtasil.training.fit", never)
+    monkeypatch.setattr("fdtasil.run.training.fit", never)
 
 
 def refused(environment, linear, kind=EnvironmentFault, **changes):

@@ -18,9 +18,9 @@ from onnx import TensorProto, helper, numpy_helper
 from sb3_agents import make_agent, save_agent
 
 import fdtasil
-from fdtasil import limits
 from fdtasil.errors import ExpertError, SettingError
 from fdtasil.experts import twin
+from fdtasil.files.onnx import limits
 
 
 @pytest.fixture

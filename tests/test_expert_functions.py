@@ -13,9 +13,9 @@ from onnx import TensorProto, helper, numpy_helper
 from sb3_agents import make_agent, save_agent
 
 import fdtasil
-from fdtasil.environments import Boxes
 from fdtasil.errors import EnvironmentFault, ExpertError, FdtasilWarning, SettingError
-from fdtasil.experts import check_expert
+from fdtasil.experts.gate import check_expert
+from fdtasil.rollouts.environments import Boxes
 
 
 @pytest.fixture

@@ -10,12 +10,12 @@ import torch
 from conftest import GAIN, mlp_onnx
 from onnx import TensorProto
 
-from fdtasil.answers import ask_probes
 from fdtasil.errors import ExpertError, FdtasilWarning
-from fdtasil.experts import load_expert
-from fdtasil.presets import PRESETS
-from fdtasil.probes import Probes
-from fdtasil.scales import statistics
+from fdtasil.experts.load import load_expert
+from fdtasil.probes.answers import ask_probes
+from fdtasil.probes.scales import measure_scales
+from fdtasil.probes.source import Probes
+from fdtasil.run.presets import PRESETS
 
 
 @pytest.fixture
@@ -93,7 +93,7 @@ def test_a_linear_experts_jacobian_is_exact(rows):
         .complete(Probes.parse("basis"))
         .with_order(1)
     )
-    expert, scales = load_expert(lambda x: x @ GAIN.T), statistics(rows)
+    expert, scales = load_expert(lambda x: x @ GAIN.T), measure_scales(rows)
     answers = ask_probes(expert, rows, probes, scales, np.random.default_rng(0))
     steps = answers.displacements.sum(axis=1)
     jacobian = (answers.values[:, :, 0] - expert.ask(rows, "label")[:, None]) / steps[:, None]
@@ -244,7 +244,7 @@ def test_the_twin_agrees_and_is_differentiable(tmp_path, rows):
         expert,
         rows,
         PRESETS["standard"].complete(Probes.parse("jacobian")).with_order(1),
-        statistics(rows),
+        measure_scales(rows),
         np.random.default_rng(0),
     )
     assert found.values.shape == (37, 5, 1, 2)
@@ -256,7 +256,7 @@ def test_a_graph_without_a_twin_says_so(tmp_path, rows):
     assert expert.module is None
     probes = PRESETS["standard"].complete(Probes.parse("jacobian")).with_order(1)
     with pytest.raises(ExpertError, match="can't be differentiated"):
-        ask_probes(expert, rows, probes, statistics(rows), np.random.default_rng(0))
+        ask_probes(expert, rows, probes, measure_scales(rows), np.random.default_rng(0))
 
 
 def test_what_the_actions_do_not_depend_on_is_no_part_of_the_twin(tmp_path, rows):

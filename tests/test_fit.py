@@ -8,13 +8,13 @@ import pytest
 import torch
 from toy_tasks import linear_task, new_student, stream
 
-from fdtasil.answers import Answers
-from fdtasil.batches import Batches
 from fdtasil.compute import pick_device, torch_settings
 from fdtasil.errors import FdtasilWarning, FitError, SettingError
-from fdtasil.fit import Hooks, fit
-from fdtasil.presets import PRESETS
-from fdtasil.scales import statistics
+from fdtasil.probes.answers import Answers
+from fdtasil.probes.scales import measure_scales
+from fdtasil.run.presets import PRESETS
+from fdtasil.student.batches import Batches
+from fdtasil.student.fit import Hooks, fit
 
 STANDARD = PRESETS["standard"]
 
@@ -145,7 +145,7 @@ def test_weights_that_overflow_in_the_last_step_are_found():
 
 @pytest.mark.fault(97)
 def test_one_state_has_raw_scales():
-    scales = statistics(np.float32([[3, 0, -1e6]]))
+    scales = measure_scales(np.float32([[3, 0, -1e6]]))
     assert scales.deviation.tolist() == scales.scale.tolist() == [1, 1, 1]
     assert scales.live.all()
 
@@ -221,7 +221,7 @@ def test_a_gpu_beyond_the_last_one_is_refused(monkeypatch):
 
 @pytest.mark.fault(91)
 def test_answers_that_take_much_memory_are_announced_before_they_are_asked(monkeypatch):
-    monkeypatch.setattr("fdtasil.answers._MUCH", 1000)
+    monkeypatch.setattr("fdtasil.probes.answers._MUCH", 1000)
     _, _, ask = linear_task(states=50, spec="5")
     with pytest.warns(FdtasilWarning, match=r"50 states x 5 probes, take 0\.0 GiB"):
         ask(0)

@@ -7,9 +7,10 @@ from conftest import GAIN, QUICK, TOY, mlp_onnx
 from toy_environments import Integrator
 
 import fdtasil
-from fdtasil.environments import Boxes
 from fdtasil.errors import ExpertError, FdtasilWarning
-from fdtasil.experts import check_expert, load_expert
+from fdtasil.experts.gate import check_expert
+from fdtasil.experts.load import load_expert
+from fdtasil.rollouts.environments import Boxes
 
 BOXES = Boxes(5, -np.ones(2, np.float32), np.ones(2, np.float32))
 NOISE = np.random.default_rng(0)
@@ -37,7 +38,7 @@ def test_every_fault_is_found_before_training(fault, monkeypatch):
     def never(*arguments, **named):
         raise AssertionError("training began")
 
-    monkeypatch.setattr("fdtasil.training.fit", never)
+    monkeypatch.setattr("fdtasil.run.training.fit", never)
     expert, found = FAULTS[fault]
     with pytest.raises(ExpertError, match=found) as error:
         fdtasil.distill(expert, TOY, 3, **QUICK)

@@ -12,10 +12,10 @@ from toy_tasks import linear_task, new_student, stream
 
 import fdtasil
 from fdtasil.errors import FitError
-from fdtasil.fit import Hooks, fit
-from fdtasil.loss import Minibatch
-from fdtasil.presets import PRESETS
-from fdtasil.steps import gradient_step
+from fdtasil.run.presets import PRESETS
+from fdtasil.student.fit import Hooks, fit
+from fdtasil.student.loss import Minibatch
+from fdtasil.student.step import gradient_step
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 

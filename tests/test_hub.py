@@ -16,7 +16,7 @@ from test_cli import shell
 
 import fdtasil
 from fdtasil.errors import ExpertError, SettingError
-from fdtasil.experts import load_expert
+from fdtasil.experts.load import load_expert
 
 try:
     import huggingface_hub

@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import torch
 
-from fdtasil.answers import ask_probes
-from fdtasil.experts import load_expert
-from fdtasil.loss import Minibatch, Weights, taylor_loss
-from fdtasil.presets import PRESETS
-from fdtasil.probes import Probes
-from fdtasil.scales import statistics
-from fdtasil.student import Student, StudentShape
+from fdtasil.experts.load import load_expert
+from fdtasil.probes.answers import ask_probes
+from fdtasil.probes.scales import measure_scales
+from fdtasil.probes.source import Probes
+from fdtasil.run.presets import PRESETS
+from fdtasil.student.loss import Minibatch, Weights, taylor_loss
+from fdtasil.student.network import Student, StudentShape
 
 
 def smooth_expert(n=6, m=3):
@@ -31,7 +31,7 @@ def batch_of(module, spec, states, order=1):
     )
     expert = load_expert(module, states.shape[1])
     random = np.random.default_rng(0)
-    answers = ask_probes(expert, states, probes, statistics(states), random, order)
+    answers = ask_probes(expert, states, probes, measure_scales(states), random, order)
     batch = Minibatch(
         torch.from_numpy(states),
         torch.from_numpy(expert.ask(states, "label")),

@@ -10,7 +10,7 @@ from conftest import QUICK, TOY
 
 import fdtasil
 from fdtasil.errors import FdtasilWarning, SettingError, StorageError
-from fdtasil.fitstate import FitState
+from fdtasil.student.fit_state import FitState
 
 
 def test_validation_keeps_the_best_weights(linear):

@@ -224,7 +224,7 @@ def test_the_papers_experts_are_copied_from_five_episodes(name, bar, apart, shar
 
 def test_a_resampling_source_stops_at_the_budget(linear, monkeypatch):
     """Falls can make it ask more than predicted, so it is held to the budget as it goes."""
-    monkeypatch.setattr("fdtasil.configuration.Configuration.check_budget", lambda self: None)
+    monkeypatch.setattr("fdtasil.run.configuration.Configuration.check_budget", lambda self: None)
     asked = []
 
     def counted(observations):

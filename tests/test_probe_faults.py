@@ -11,12 +11,12 @@ from gymnasium.spaces import Box
 from toy_environments import Integrator
 
 import fdtasil
-from fdtasil.answers import ask_probes
 from fdtasil.errors import ExpertError, FdtasilWarning, SettingError
-from fdtasil.experts import load_expert
-from fdtasil.presets import PRESETS
-from fdtasil.probes import Probes
-from fdtasil.scales import statistics
+from fdtasil.experts.load import load_expert
+from fdtasil.probes.answers import ask_probes
+from fdtasil.probes.scales import measure_scales
+from fdtasil.probes.source import Probes
+from fdtasil.run.presets import PRESETS
 
 BOX = Box(-np.inf, np.inf, (5,), np.float64)
 
@@ -28,7 +28,7 @@ def seen_through(change, box=BOX):
 
 def asked(expert, states, spec, seed=0):
     probes = PRESETS["standard"].complete(Probes.parse(spec)).with_order(1)
-    scales = statistics(states)
+    scales = measure_scales(states)
     return ask_probes(load_expert(expert), states, probes, scales, np.random.default_rng(seed))
 
 
@@ -264,7 +264,7 @@ def test_probes_are_not_clipped_to_the_bounds_of_the_observations(linear):
 
 @pytest.mark.fault(93)
 def test_an_expert_that_refuses_what_lies_outside_is_told_why_before_training(linear, monkeypatch):
-    monkeypatch.setattr("fdtasil.training.fit", never)
+    monkeypatch.setattr("fdtasil.run.training.fit", never)
 
     def strict(rows):
         if np.abs(rows[:, :4]).max() > 1.2:

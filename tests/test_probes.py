@@ -4,16 +4,10 @@ import numpy as np
 import pytest
 
 from fdtasil.errors import SettingError
-from fdtasil.probes import (
-    CENTRAL,
-    DIRECTIONS,
-    FORWARD,
-    AdaptiveDirections,
-    OrthogonalFrames,
-    Probes,
-    RandomSphere,
-    is_redundant,
-)
+from fdtasil.probes.adaptive import AdaptiveDirections, is_redundant
+from fdtasil.probes.directions import OrthogonalFrames, RandomSphere
+from fdtasil.probes.source import DIRECTIONS, Probes
+from fdtasil.probes.stencils import CENTRAL, FORWARD
 
 COUNTS = {"basis": None, "jacobian": None}
 

@@ -10,18 +10,20 @@ from conftest import GAIN, mlp_onnx
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fdtasil.answers import Answers, ask_probes
-from fdtasil.calibration import Calibration, Ladder, calibrate
-from fdtasil.datasets import Dataset
-from fdtasil.demonstrations import Demonstrations
-from fdtasil.experts import load_expert
-from fdtasil.fitstate import FitState
-from fdtasil.presets import PRESETS
-from fdtasil.probes import CENTRAL, DIRECTIONS, EXACT, FORWARD, LABELS, OrthogonalFrames, Probes
-from fdtasil.scales import statistics
+from fdtasil.demonstrations.dataset import Dataset
+from fdtasil.demonstrations.states import Demonstrations
+from fdtasil.experts.load import load_expert
+from fdtasil.files.storage import sha256, verify, write_folder
+from fdtasil.probes.answers import Answers, ask_probes
+from fdtasil.probes.calibration import Calibration, Ladder, calibrate
+from fdtasil.probes.directions import OrthogonalFrames
+from fdtasil.probes.scales import measure_scales
+from fdtasil.probes.source import DIRECTIONS, Probes
+from fdtasil.probes.stencils import CENTRAL, EXACT, FORWARD, LABELS
+from fdtasil.run.presets import PRESETS
 from fdtasil.seeding import torch_generator
-from fdtasil.storage import sha256, verify, write_folder
-from fdtasil.student import ACTIVATIONS, Student, StudentShape
+from fdtasil.student.fit_state import FitState
+from fdtasil.student.network import ACTIVATIONS, Student, StudentShape
 
 
 def few(examples):
@@ -65,7 +67,7 @@ def test_a_linear_experts_jacobian_is_exact(design, stencil, sizes, exponents, o
     expert = load_expert(lambda rows: (rows.astype(np.float64) - centre) @ matrix)
     preset = PRESETS["standard"]
     probes = replace(preset, calibrated=False).complete(Probes.parse(f"{design},{stencil}"))
-    found = statistics(states)
+    found = measure_scales(states)
     answers = ask_probes(expert, states, probes, found, np.random.default_rng(0))
     assert np.isfinite(answers.values).all()
     live = np.flatnonzero(found.live)
@@ -266,7 +268,7 @@ def test_a_calibration_reads_back(seed, curve, rays, steps):
     states = random_array(seed, (30, 5))
     expert = load_expert(lambda rows: np.sin(curve * rows @ GAIN.T))
     random = np.random.default_rng(seed)
-    found = calibrate(expert, states, statistics(states), random, 0.3, Ladder(rays, steps))
+    found = calibrate(expert, states, measure_scales(states), random, 0.3, Ladder(rays, steps))
     text = json.dumps(found.to_json(), allow_nan=False)
     again = Calibration.from_json(json.loads(text))
     assert again.to_json() == found.to_json()

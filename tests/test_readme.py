@@ -5,7 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from fdtasil.cli import COMMANDS
+from fdtasil.shell.main import COMMANDS
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()

@@ -7,8 +7,8 @@ import pytest
 from conftest import QUICK, TOY, mlp_onnx
 
 import fdtasil
-from fdtasil import runfolder
 from fdtasil.errors import FdtasilWarning, SettingError
+from fdtasil.run import folder as runfolder
 
 FILES = (
     "student.safetensors",
@@ -163,7 +163,7 @@ def test_a_resumed_run_stays_in_its_own_folder(expert, tmp_path):
 @pytest.mark.parametrize("kept", [0, 1, 3])
 def test_stopped_while_the_probes_are_asked_nothing_is_lost(kept, tmp_path, monkeypatch):
     """Demonstrations are kept before the probes, and the answers on the way, block by block."""
-    monkeypatch.setattr("fdtasil.answers._ROWS", 500)
+    monkeypatch.setattr("fdtasil.probes.answers._ROWS", 500)
     run = {**QUICK, "episodes": 5, "horizon": 40, "probes": "sphere:10,forward"}
     blocks, last, acting = 0, None, 0
 

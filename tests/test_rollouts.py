@@ -7,10 +7,10 @@ from conftest import GAIN, TOY
 from gymnasium.spaces import Box
 from toy_environments import Integrator
 
-from fdtasil.behaviours import Decision, follow
-from fdtasil.environments import EnvironmentPool, resolve_horizon
 from fdtasil.errors import EnvironmentFault, FdtasilWarning, SettingError
-from fdtasil.rollouts import rollout
+from fdtasil.rollouts.behaviours import Decision, follow
+from fdtasil.rollouts.environments import EnvironmentPool, resolve_horizon
+from fdtasil.rollouts.rollout import rollout
 
 WALLED = "toy_environments:toy/Walled-v0"
 

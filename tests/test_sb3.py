@@ -26,8 +26,10 @@ from stable_baselines3.common.torch_layers import FlattenExtractor
 
 import fdtasil
 from fdtasil.errors import SettingError
-from fdtasil.onnx_files import open_session, read_model, run_session
-from fdtasil.sb3 import export_sb3, read_agent
+from fdtasil.experts.sb3.agent import read_agent
+from fdtasil.experts.sb3.export import export_sb3
+from fdtasil.files.onnx.model import read_model
+from fdtasil.files.onnx.session import open_session, run_session
 
 SHARED_AGENTS = Path(__file__).parents[2] / "shared" / "agents"
 ACTIVATIONS = [
@@ -208,7 +210,7 @@ def test_export_from_a_shell(save, monkeypatch, capsys, tmp_path):
     source, out = save(make_agent("PPO")), tmp_path / "out.onnx"
     line = ["fdtasil", "export-sb3", str(source), "--out", str(out), "--env", "Pendulum-v1"]
     monkeypatch.setattr("sys.argv", line)
-    from fdtasil.cli import main
+    from fdtasil.shell.main import main
 
     with pytest.raises(SystemExit):
         main()

@@ -11,7 +11,8 @@ import torch
 from sb3_agents import answers, make_agent, rewrite, save_agent, states_for
 
 from fdtasil.errors import ExpertError, SettingError
-from fdtasil.sb3 import export_sb3, read_agent
+from fdtasil.experts.sb3.agent import read_agent
+from fdtasil.experts.sb3.export import export_sb3
 
 
 @pytest.fixture

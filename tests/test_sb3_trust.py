@@ -31,8 +31,10 @@ from stable_baselines3.common.torch_layers import BaseFeaturesExtractor
 
 import fdtasil
 from fdtasil.errors import ExpertError, SettingError
-from fdtasil.onnx_files import open_session, read_model, run_session
-from fdtasil.sb3 import export_sb3, read_agent
+from fdtasil.experts.sb3.agent import read_agent
+from fdtasil.experts.sb3.export import export_sb3
+from fdtasil.files.onnx.model import read_model
+from fdtasil.files.onnx.session import open_session, run_session
 
 
 @pytest.fixture

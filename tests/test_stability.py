@@ -12,7 +12,7 @@ from benchmarks.stability import NUS, SOURCES, STABILITY, follow_student
 from benchmarks.stability_table import breaks_at
 from benchmarks.synthetic_system import SIZE, SyntheticSystem, advance, as_function, make_expert
 from fdtasil import load_expert
-from fdtasil.environments import EnvironmentPool
+from fdtasil.rollouts.environments import EnvironmentPool
 
 STARTS = np.random.default_rng(0).standard_normal((4, SIZE))
 

@@ -10,10 +10,10 @@ from conftest import QUICK, TOY
 
 import fdtasil
 from fdtasil import errors
-from fdtasil.datasets import Dataset
+from fdtasil.demonstrations.dataset import Dataset
 from fdtasil.errors import SettingError, StorageError
+from fdtasil.files.storage import sha256, to_json, verify, write_bytes, write_folder
 from fdtasil.seeding import episode_seeds, generator, torch_generator
-from fdtasil.storage import sha256, to_json, verify, write_bytes, write_folder
 
 KINDS = [
     kind

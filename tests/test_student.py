@@ -7,9 +7,9 @@ import pytest
 import torch
 
 from fdtasil.errors import ExportError, SettingError, StorageError
-from fdtasil.onnx_files import export_module
+from fdtasil.files.onnx.export import export_module
 from fdtasil.seeding import torch_generator
-from fdtasil.student import ACTIVATIONS, Student, StudentShape
+from fdtasil.student.network import ACTIVATIONS, Student, StudentShape
 
 
 def make(hidden=(16, 8), activation="gelu", low=(-2.0, -1.0), high=(2.0, 3.0), seed=0):

@@ -5,11 +5,11 @@ import pytest
 from conftest import GAIN, QUICK, TOY
 
 import fdtasil
-from fdtasil.environments import EnvironmentPool
+from fdtasil.demonstrations.trainers import TRAINERS, DAgger, Dart, Situation, trainer_of
 from fdtasil.errors import SettingError
-from fdtasil.experts import load_expert
-from fdtasil.rollouts import rollout
-from fdtasil.trainers import TRAINERS, DAgger, Dart, Situation, trainer_of
+from fdtasil.experts.load import load_expert
+from fdtasil.rollouts.environments import EnvironmentPool
+from fdtasil.rollouts.rollout import rollout
 
 ROWS = np.random.default_rng(0).uniform(-0.5, 0.5, (400, 5)).astype(np.float32)
 

@@ -10,8 +10,8 @@ import torch
 from conftest import QUICK, TOY
 
 import fdtasil
-from fdtasil import runfolder
 from fdtasil.errors import ExpertError, FitError, SettingError
+from fdtasil.run import folder as runfolder
 
 WHOLE = {"steps": 40, "hidden": 8}
 
@@ -33,7 +33,7 @@ def refused(dataset, monkeypatch):
     def never(*arguments, **named):
         raise AssertionError("training began")
 
-    monkeypatch.setattr("fdtasil.training.fit", never)
+    monkeypatch.setattr("fdtasil.run.training.fit", never)
     with pytest.raises(SettingError, match="demonstrations whose") as error:
         fdtasil.distill(demonstrations=dataset, **WHOLE)
     assert len(str(error.value).splitlines()) <= 6
@@ -184,8 +184,8 @@ def test_a_full_gpu_leaves_a_run_that_goes_on_elsewhere(
 
     run = {**QUICK, "probes": 4}
     with monkeypatch.context() as patch:
-        patch.setattr("fdtasil.training.fit", full)
-        patch.setattr("fdtasil.pipeline.pick_device", lambda name: torch.device("cpu"))
+        patch.setattr("fdtasil.run.training.fit", full)
+        patch.setattr("fdtasil.run.pipeline.pick_device", lambda name: torch.device("cpu"))
         with pytest.raises(FitError, match=f"no GPU memory left: {said}") as raised:
             fdtasil.distill(linear, TOY, out=tmp_path, device="cuda", **run)
     assert any("resume=" in note for note in raised.value.__notes__)

@@ -4,14 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from fdtasil.answers import ask_probes
-from fdtasil.demonstrations import Demonstrations
-from fdtasil.experts import load_expert
-from fdtasil.presets import PRESETS
-from fdtasil.probes import Probes
-from fdtasil.scales import statistics
+from fdtasil.demonstrations.states import Demonstrations
+from fdtasil.experts.load import load_expert
+from fdtasil.probes.answers import ask_probes
+from fdtasil.probes.scales import measure_scales
+from fdtasil.probes.source import Probes
+from fdtasil.run.presets import PRESETS
 from fdtasil.seeding import torch_generator
-from fdtasil.student import Student, StudentShape
+from fdtasil.student.network import Student, StudentShape
 
 
 def linear_task(states=200, n=6, m=2, spec=None):
@@ -28,7 +28,7 @@ def linear_task(states=200, n=6, m=2, spec=None):
     probes = (
         replace(PRESETS["standard"], calibrated=False).complete(Probes.parse(spec)).with_order(1)
     )
-    scales = statistics(observations)
+    scales = measure_scales(observations)
 
     def ask(pool):
         return ask_probes(expert, observations, probes, scales, np.random.default_rng(pool))

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from fdtasil.behaviours import follow
-from fdtasil.environments import EnvironmentPool
-from fdtasil.experts import load_expert
-from fdtasil.recording import Episodes
-from fdtasil.rollouts import rollout
+from fdtasil.experts.load import load_expert
+from fdtasil.rollouts.behaviours import follow
+from fdtasil.rollouts.environments import EnvironmentPool
+from fdtasil.rollouts.episodes import Episodes
+from fdtasil.rollouts.rollout import rollout
 from fdtasil.seeding import episode_seeds
 
 SHIPPED = Path(__file__).parents[2] / "experts"

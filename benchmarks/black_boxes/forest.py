@@ -4,7 +4,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fdtasil.experts import Expert
+from fdtasil.experts.expert import Expert
 
 from .box import measure
 from .visits import shipped_expert, visited

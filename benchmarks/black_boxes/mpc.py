@@ -8,7 +8,8 @@ import mujoco
 import numpy as np
 from mujoco import rollout
 
-from fdtasil.experts import Expert, load_expert
+from fdtasil.experts.expert import Expert
+from fdtasil.experts.load import load_expert
 
 ENVIRONMENT = "Reacher-v5"
 _LINKS = 0.1, 0.11  # metres from shoulder to elbow, from elbow to fingertip

@@ -9,7 +9,7 @@ from threading import Thread
 
 import numpy as np
 
-from fdtasil.experts import Expert
+from fdtasil.experts.expert import Expert
 
 from .visits import shipped_expert
 

@@ -4,10 +4,11 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from fdtasil.behaviours import Behaviour, Decision
-from fdtasil.environments import EnvironmentPool
-from fdtasil.experts import Expert, load_expert
-from fdtasil.rollouts import rollout
+from fdtasil.experts.expert import Expert
+from fdtasil.experts.load import load_expert
+from fdtasil.rollouts.behaviours import Behaviour, Decision
+from fdtasil.rollouts.environments import EnvironmentPool
+from fdtasil.rollouts.rollout import rollout
 from fdtasil.seeding import episode_seeds, generator
 
 from .box import SHIPPED

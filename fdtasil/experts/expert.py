@@ -1,7 +1,7 @@
 """The one type that every kind of expert is turned into: a counted, checked black box."""
 
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Literal, Protocol
 
@@ -172,3 +172,8 @@ def _converted(observations: object) -> np.ndarray:
         raise ValueError(f"numpy takes them for {given.dtype}")
     with np.errstate(over="ignore"):  # what is infinite then is refused
         return np.ascontiguousarray(given, np.float32)
+
+
+def rows_text(queries: Mapping[str, int]) -> str:
+    """Return rows by purpose as one line of text, without those that are none."""
+    return ", ".join(f"{purpose} {rows:,}" for purpose, rows in queries.items() if rows)

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fdtasil.environments import Boxes
 from fdtasil.errors import ExpertError, FdtasilError, FdtasilWarning
 from fdtasil.experts.expert import Expert
+from fdtasil.rollouts.environments import Boxes
 
 __all__ = ["Finding", "check_expert", "examine_expert"]
 
@@ -178,3 +178,9 @@ class _Probe:
 def _numbers(values: np.ndarray) -> str:
     """Return one number where all are equal, else the list."""
     return f"{values[0]:g}" if np.all(values == values[0]) else str(values)
+
+
+GATE_STATES = 16  # states that the gate asks about, before and after the expert's first rollouts
+
+
+_ROWS_A_STATE = 3  # asked, asked again, asked alone

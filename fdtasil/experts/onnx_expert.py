@@ -11,7 +11,8 @@ import numpy as np
 from fdtasil.errors import ExpertError, FdtasilWarning, first_line, shown
 from fdtasil.experts.expert import Expert
 from fdtasil.experts.twin import torch_twin
-from fdtasil.onnx_files import is_batched, open_session, read_model, rebatched, run_session
+from fdtasil.files.onnx.model import read_model
+from fdtasil.files.onnx.session import is_batched, open_session, rebatched, run_session
 
 if TYPE_CHECKING:
     import onnx

@@ -9,12 +9,7 @@ import numpy as np
 
 from fdtasil.errors import SettingError
 from fdtasil.probes.adaptive import AdaptiveDirections
-from fdtasil.probes.directions import (
-    Directions,
-    OrthogonalFrames,
-    RandomSphere,
-    StandardBasis,
-)
+from fdtasil.probes.directions import Directions, OrthogonalFrames, RandomSphere, StandardBasis
 from fdtasil.probes.stencils import CENTRAL, EXACT, FORWARD, LABELS, STENCILS, Stencil
 
 __all__ = ["DIRECTIONS", "USUAL_COUNT", "Probes"]

@@ -12,11 +12,10 @@ from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
 
 from fdtasil.errors import ExpertError, first_line
-from fdtasil.experts.hub.errors import no_file
 from fdtasil.experts.hub.place import COMMIT, Place, is_hub_uri, parse
-from fdtasil.experts.hub.requests import download, look_up
-from fdtasil.onnx_files import side_files
-from fdtasil.storage import sha256, stays_inside, write_bytes
+from fdtasil.experts.hub.requests import download, look_up, no_file
+from fdtasil.files.onnx.model import side_files
+from fdtasil.files.storage import sha256, stays_inside, write_bytes
 
 if TYPE_CHECKING:
     from huggingface_hub.hf_api import RepoSibling

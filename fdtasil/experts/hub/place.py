@@ -6,7 +6,7 @@ from pathlib import Path, PurePosixPath
 from typing import TypeGuard
 
 from fdtasil.errors import ExpertError
-from fdtasil.storage import stays_inside
+from fdtasil.files.storage import stays_inside
 
 __all__ = ["COMMIT", "Place", "is_hub_uri", "malformed", "parse"]
 

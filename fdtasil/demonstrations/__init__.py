@@ -1,0 +1,1 @@
+"""What is learnt from: who acts in which round, labelled states, and their files."""

@@ -1,0 +1,169 @@
+"""Labelled states with their probes, on disk and apart from the run that made them."""
+
+import io
+import json
+import zipfile
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fdtasil.demonstrations.states import Demonstrations
+from fdtasil.errors import SettingError, StorageError
+from fdtasil.files.storage import is_written, verify
+from fdtasil.probes.answers import Answers
+from fdtasil.probes.source import Probes
+
+__all__ = ["Dataset", "DatasetLike", "load_dataset"]
+
+_VERSION = 1
+
+
+@dataclass(frozen=True)
+class Dataset:
+    """Everything that a student can be trained from without one new question.
+
+    Attributes:
+        demonstrations: The labelled states.
+        probes: The source of `answers`, or None.
+        answers: The expert's answers around each state, or None.
+        low: (m,) lower action bounds; -inf where there is none.
+        high: (m,) upper action bounds.
+        environment: What the environment is called.
+    """
+
+    demonstrations: Demonstrations
+    probes: Probes | None
+    answers: Answers | None
+    low: np.ndarray
+    high: np.ndarray
+    environment: str
+
+    @property
+    def sizes(self) -> tuple[int, int]:
+        """(n, m), the lengths of an observation and of an action."""
+        states = self.demonstrations
+        return states.observations.shape[1], states.actions.shape[1]
+
+    def to_bytes(self) -> bytes:
+        """Return the dataset as an npz file.
+
+        Schema, version 1, all little-endian and without pickles: `observations` (N, n) float32,
+        `actions` (N, m) float32 (the expert's), `episode` (N,) and `round` (N,) int32, `taken`
+        (N, m) float32, `rewards` (N,) float64 and `terminated` (N,) bool as in `Demonstrations`,
+        `low` and `high` (m,) float32; with probes also `displacements` (P, n) float32, `numbers`
+        (N, k) int32, `values` (N, k, p, m) float32 and `gain` () float64 as in `Answers`; and
+        `about`, JSON text as bytes: version, environment, probes.
+        """
+        arrays: dict[str, Any] = dict(vars(self.demonstrations))
+        arrays |= {"low": self.low, "high": self.high}
+        if self.answers is not None:
+            arrays |= vars(self.answers)
+        about = {
+            "version": _VERSION,
+            "environment": self.environment,
+            "probes": self.probes.describe() if self.probes else "none",
+        }
+        arrays["about"] = np.frombuffer(json.dumps(about).encode(), np.uint8)
+        target = io.BytesIO()
+        np.savez(target, **arrays)
+        return target.getvalue()
+
+    @staticmethod
+    def from_bytes(data: bytes) -> "Dataset":
+        """Read what `to_bytes` wrote; nothing is unpickled.
+
+        Raises:
+            StorageError: If it is not such a file, or of a later version.
+        """
+        try:
+            with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
+                return _read(dict(arrays))
+        except (KeyError, TypeError, ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
+            raise StorageError(
+                f"not demonstrations: {type(error).__name__} {error}".splitlines()[0],
+                "a demonstrations.npz written by fdtasil",
+                "check the path, or save again",
+            ) from error
+
+
+DatasetLike = Dataset | str | Path
+
+
+def load_dataset(source: DatasetLike) -> Dataset:
+    """Open demonstrations: a `Dataset`, a run folder, or its demonstrations.npz.
+
+    Raises:
+        StorageError: If there are none.
+        SettingError: If they are empty, of shapes that do not go together, or not finite.
+    """
+    if isinstance(source, Dataset):
+        return _checked(source)
+    path = Path(source)
+    file = path / "demonstrations.npz" if path.is_dir() else path
+    try:
+        if path.is_dir() and is_written(path):
+            data = verify(path, [file.name])[file.name]
+        else:
+            data = file.read_bytes()
+        return _checked(Dataset.from_bytes(data))
+    except OSError as error:
+        if isinstance(error, StorageError):
+            error.add_note(f"read from {file}")
+            raise
+        raise StorageError(
+            f"{file} can't be read: {error.strerror}",
+            "a run folder, or its demonstrations.npz",
+            "check the path",
+        ) from error
+
+
+def _checked(dataset: Dataset) -> Dataset:
+    """Return a dataset that a student can be trained from: one NaN in it makes all weights NaN."""
+    states, answers = dataset.demonstrations, dataset.answers
+    arrays = dict(vars(states)) | {"low": dataset.low, "high": dataset.high}
+    shapes = {"observations": "Nn", "actions": "Nm", "taken": "Nm", "low": "m", "high": "m"}
+    shapes |= dict.fromkeys(("episode", "round", "rewards", "terminated"), "N")
+    if answers is not None:
+        arrays |= {name: getattr(answers, name) for name in ("displacements", "numbers", "values")}
+        shapes |= {"displacements": "Pn", "numbers": "Nk", "values": "Nkpm"}
+    sizes: dict[str, int] = {}
+    for name, letters in shapes.items():
+        shape = arrays[name].shape
+        agrees = len(shape) == len(letters) and all(
+            sizes.setdefault(letter, size) == size
+            for letter, size in zip(letters, shape, strict=True)
+        )
+        if not agrees or sizes["N"] == 0:
+            expected = ", ".join(f"{letter}={sizes.get(letter, 'any')}" for letter in letters)
+            raise SettingError(
+                f"demonstrations whose {name} have the shape {shape}",
+                f"({', '.join(letters)}) with {expected}, and N at least 1",
+                "record at least one episode, one row of each array for each state",
+            )
+    for name in ("observations", "actions", "displacements", "values"):
+        if name in arrays and not np.isfinite(arrays[name]).all():
+            bad = np.flatnonzero([not np.isfinite(row).all() for row in arrays[name]])
+            raise SettingError(
+                f"demonstrations whose {name} are not finite in {len(bad)} of "
+                f"{len(arrays[name])} rows, the first of them row {bad[0]}",
+                "finite numbers",
+                "drop these rows, and find out what made them",
+            )
+    return dataset
+
+
+def _read(arrays: dict[str, np.ndarray]) -> Dataset:
+    about = json.loads(arrays["about"].tobytes())
+    if about["version"] > _VERSION:
+        raise ValueError(f"version {about['version']} is newer than this fdtasil")
+    names = [field.name for field in fields(Demonstrations)]
+    demonstrations = Demonstrations(*(arrays[name] for name in names))
+    answers = None
+    if "values" in arrays:
+        bank, numbers, values = (arrays[name] for name in ("displacements", "numbers", "values"))
+        answers = Answers(bank, numbers, values, float(arrays["gain"]))
+    probes = Probes.parse(about["probes"])
+    bounds = arrays["low"], arrays["high"]
+    return Dataset(demonstrations, probes, answers, *bounds, about["environment"])

@@ -1,0 +1,143 @@
+"""Minari datasets in and out; the package minari (`[data]`) is loaded when one is."""
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+import gymnasium
+import numpy as np
+
+from fdtasil.demonstrations.dataset import Dataset
+from fdtasil.demonstrations.states import Demonstrations
+from fdtasil.errors import SettingError, StorageError
+
+if TYPE_CHECKING:
+    import minari
+
+__all__ = ["from_minari", "to_minari"]
+
+EXPERT_ACTION, DISPLACEMENTS, VALUES = "expert_action", "probe_displacements", "probe_values"
+"""Keys of an exported dataset's infos."""
+
+
+def from_minari(source: "str | minari.MinariDataset") -> Dataset:
+    """Read demonstrations from a local Minari dataset.
+
+    Its actions are taken as the expert's, unless its infos hold "expert_action", as `to_minari`
+    writes it. Answers to probes are not read.
+
+    Args:
+        source: A dataset, or the id of one that lies on this machine; nothing is downloaded.
+
+    Raises:
+        StorageError: If there is no such dataset.
+        SettingError: If its spaces are not flat boxes, or minari is not installed.
+    """
+    minari = _minari()
+    try:
+        data = minari.load_dataset(source) if isinstance(source, str) else source
+    except (FileNotFoundError, ValueError, KeyError) as error:
+        raise StorageError(
+            f"no Minari dataset {source!r} on this machine",
+            "one that `minari list local` shows",
+            f"minari download {source}",
+        ) from error
+    spaces = (data.observation_space, data.action_space)
+    if not all(isinstance(s, gymnasium.spaces.Box) and len(s.shape) == 1 for s in spaces):
+        raise SettingError(
+            f"a dataset with observations {spaces[0]} and actions {spaces[1]}",
+            "boxes with one dimension",
+            "flatten it, or choose another",
+        )
+    episodes = [_read(number, episode) for number, episode in enumerate(data.iterate_episodes())]
+    if not episodes:
+        raise StorageError(f"{source!r} has no episodes", "at least one", "choose another dataset")
+    states = episodes[0]
+    for episode in episodes[1:]:
+        states = states + episode
+    low, high = (np.asarray(bound, np.float32) for bound in (spaces[1].low, spaces[1].high))
+    name = data.env_spec.id if data.env_spec else data.spec.dataset_id
+    return Dataset(states, None, None, low, high, name)
+
+
+def to_minari(dataset: Dataset, dataset_id: str, **about: str) -> "minari.MinariDataset":
+    """Write demonstrations as a local Minari dataset.
+
+    An episode's actions are those that were taken; infos hold the expert's at every step
+    ("expert_action") and, with probes, "probe_displacements" and "probe_values" as in `Answers`.
+    The state after the last step is not recorded, so the last observation stands twice.
+
+    Args:
+        dataset: What to write.
+        dataset_id: Minari's id, for example "cheetah/sac-v0".
+        **about: Minari's algorithm_name, author, author_email, code_permalink, description.
+
+    Raises:
+        SettingError: If minari is not installed.
+        StorageError: If the dataset exists already or can't be written.
+    """
+    minari = _minari()
+    # Its type says lists, it takes arrays, and its own module would import jax to add steps.
+    buffer: Any = importlib.import_module("minari.data_collector").EpisodeBuffer
+    states, n = dataset.demonstrations, dataset.sizes[0]
+    buffers = []
+    for number in np.unique(states.episode):
+        rows = np.flatnonzero(states.episode == number)
+        steps, doubled = len(rows), np.append(rows, rows[-1])
+        infos: dict[str, Any] = {EXPERT_ACTION: states.actions[doubled]}
+        if dataset.answers is not None:
+            infos[DISPLACEMENTS] = dataset.answers.displacements[dataset.answers.numbers[doubled]]
+            infos[VALUES] = dataset.answers.values[doubled]
+        buffers.append(
+            buffer(
+                id=int(number),
+                observations=states.observations[doubled],
+                actions=states.taken[rows],
+                rewards=states.rewards[rows].tolist(),
+                terminations=states.terminated[rows].tolist(),
+                truncations=[False] * (steps - 1) + [not states.terminated[rows[-1]]],
+                infos=infos,
+            )
+        )
+    try:
+        return minari.create_dataset_from_buffers(
+            dataset_id,
+            buffers,
+            observation_space=gymnasium.spaces.Box(-np.inf, np.inf, (n,), np.float32),
+            action_space=gymnasium.spaces.Box(dataset.low, dataset.high, dtype=np.float32),
+            requirements=[],
+            **about,
+        )
+    except (OSError, ValueError, AssertionError) as error:
+        raise StorageError(
+            f"Minari can't write {dataset_id!r}: {error}".splitlines()[0],
+            "a new id such as cheetah/sac-v0",
+            f"choose another id, or `minari delete {dataset_id}`",
+        ) from error
+
+
+def _read(number: int, episode: Any) -> Demonstrations:
+    steps = len(episode.rewards)
+    taken = np.asarray(episode.actions, np.float32)[:steps]
+    infos = episode.infos or {}
+    labels = np.asarray(infos.get(EXPERT_ACTION, taken), np.float32)[:steps]
+    return Demonstrations(
+        np.asarray(episode.observations, np.float32)[:steps],
+        labels,
+        np.full(steps, number, np.int32),
+        np.zeros(steps, np.int32),
+        taken,
+        np.asarray(episode.rewards, np.float64),
+        np.asarray(episode.terminations, bool),
+    )
+
+
+def _minari() -> Any:
+    try:
+        import minari
+    except ImportError as error:
+        raise SettingError(
+            f"Minari datasets without the package minari ({error})",
+            "minari[hdf5]",
+            'pip install "fdtasil[data]"',
+        ) from error
+    return minari

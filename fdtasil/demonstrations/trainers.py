@@ -1,0 +1,281 @@
+"""Who acts in round i: that is all a trainer is."""
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from numbers import Real
+from typing import Literal, Protocol
+
+import numpy as np
+
+from fdtasil.errors import SettingError
+from fdtasil.experts.expert import Expert
+from fdtasil.rollouts.behaviours import Behaviour, Decision, Policy
+from fdtasil.rollouts.episodes import Episodes
+
+__all__ = [
+    "TRAINERS",
+    "BehaviourCloning",
+    "DAgger",
+    "Dart",
+    "Situation",
+    "Trainer",
+    "describe_trainer",
+    "trainer_of",
+]
+
+UPDATES = (1, 5, 20, 30)
+"""Trajectories after which the paper's DAgger and DART train anew (TaSIL, appendix)."""
+
+
+@dataclass(frozen=True)
+class Situation:
+    """What a trainer knows at the start of a round.
+
+    Attributes:
+        round: i.
+        expert: Answers, and counts its rows under "act".
+        student: The last round's policy; None in round 0.
+        record: Behaviour and number of episodes -> that many extra episodes of the round, which
+            are not labelled; their expert rows count.
+    """
+
+    round: int
+    expert: Expert
+    student: Policy | None
+    record: Callable[[Behaviour, int], Episodes]
+
+
+class Trainer(Protocol):
+    """Decides how the episodes are split into rounds, and who acts in each.
+
+    Attributes:
+        name: What reports call it.
+    """
+
+    @property
+    def name(self) -> str: ...  # noqa: D102
+
+    def rounds(self, episodes: int) -> list[int]:
+        """Return the number of episodes of each round; their sum is `episodes`."""
+        ...
+
+    def behaviour(self, situation: Situation) -> Behaviour:
+        """Return who acts in the situation's round."""
+        ...
+
+    def queries(self, episodes: int, horizon: int) -> dict[str, int]:
+        """Return the rows asked for acting and for labels, where no episode ends early."""
+        ...
+
+
+@dataclass(frozen=True)
+class BehaviourCloning:
+    """The expert acts, once."""
+
+    name: str = field(default="bc", init=False)
+
+    def rounds(self, episodes: int) -> list[int]:
+        """One round of all episodes."""
+        return [episodes]
+
+    def behaviour(self, situation: Situation) -> Behaviour:
+        """The expert's own actions, which are the labels at the same time."""
+        return _expert_acts(situation.expert)
+
+    def queries(self, episodes: int, horizon: int) -> dict[str, int]:
+        """One row for each step."""
+        return {"act": episodes * horizon, "label": 0}
+
+
+@dataclass(frozen=True)
+class DAgger:
+    """A mixture of expert and student acts; the expert labels (Ross et al. 2011).
+
+    Attributes:
+        updates: Numbers of episodes after which the student is trained anew.
+        beta: Share of the expert: a number b for b**round, or a function of the round. With a
+            share of 0 the student acts alone, and the states are labelled afterwards.
+        mix: "blend" (TaSIL: the convex combination of the two actions) or "switch" (the original:
+            one of the two, drawn at each step).
+    """
+
+    updates: tuple[int, ...] = UPDATES
+    beta: float | Callable[[int], float] = 0.5
+    mix: Literal["blend", "switch"] = "blend"
+    name: str = field(default="dagger", init=False)
+
+    def __post_init__(self) -> None:
+        _check_updates(self.updates)
+        if self.mix not in ("blend", "switch"):
+            raise SettingError(f"mix={self.mix!r}", '"blend" or "switch"', "choose one of these")
+        if not callable(self.beta):
+            _check_share(self.beta)
+
+    def share(self, round_: int) -> float:
+        """Return the expert's share in a round."""
+        return _check_share(self.beta(round_) if callable(self.beta) else self.beta**round_)
+
+    def rounds(self, episodes: int) -> list[int]:
+        """The episodes between two updates; the last round ends with the budget."""
+        return _between(self.updates, episodes)
+
+    def behaviour(self, situation: Situation) -> Behaviour:
+        """The mixture; round 0 is the expert's, for there is no student yet."""
+        student, expert = situation.student, situation.expert
+        if student is None:
+            return _expert_acts(expert)
+        share = self.share(situation.round)
+        mix = _blend if self.mix == "blend" else _switch
+
+        def act(observations: np.ndarray, noise: Sequence[np.random.Generator]) -> Decision:
+            own = student(observations)
+            if share == 0:
+                return Decision(own, None)
+            answers = expert.ask(observations, "act")
+            return Decision(mix(answers, own, share, noise), answers)
+
+        return act
+
+    def queries(self, episodes: int, horizon: int) -> dict[str, int]:
+        """One row for each step, under "label" where the student acts alone."""
+        found = {"act": 0, "label": 0}
+        for round_, count in enumerate(self.rounds(episodes)):
+            alone = round_ > 0 and self.share(round_) == 0
+            found["label" if alone else "act"] += count * horizon
+        return found
+
+
+@dataclass(frozen=True)
+class Dart:
+    """The expert acts with Gaussian noise as large as the student's error (Laskey et al. 2017).
+
+    Attributes:
+        updates: Numbers of episodes after which student and noise are made anew.
+        alpha: 0 takes the covariance of the student's error as it is (TaSIL's choice); a positive
+            number scales it so that an episode's expected squared noise sums up to alpha (DART,
+            equation 4: alpha / (T tr(covariance))).
+        extra: Episodes of the expert that the student's error is estimated on, in each round but
+            the first; they are not trained on.
+    """
+
+    updates: tuple[int, ...] = UPDATES
+    alpha: float = 0.0
+    extra: int = 5
+    name: str = field(default="dart", init=False)
+
+    def __post_init__(self) -> None:
+        _check_updates(self.updates)
+        if not 0 <= self.alpha < float("inf"):
+            raise SettingError(f"alpha={self.alpha!r}", "a number of at least 0", "write alpha=0")
+        if isinstance(self.extra, bool) or not isinstance(self.extra, int) or self.extra < 1:
+            raise SettingError(f"extra={self.extra!r}", "a positive integer", "write extra=5")
+
+    def rounds(self, episodes: int) -> list[int]:
+        """The episodes between two updates; the last round ends with the budget."""
+        return _between(self.updates, episodes)
+
+    def behaviour(self, situation: Situation) -> Behaviour:
+        """The noisy expert; its labels are without noise."""
+        expert = situation.expert
+        if situation.student is None:
+            return _expert_acts(expert)
+        spread = self._spread(situation, situation.student)
+
+        def act(observations: np.ndarray, noise: Sequence[np.random.Generator]) -> Decision:
+            answers = expert.ask(observations, "act")
+            normal = np.stack([random.standard_normal(len(spread)) for random in noise])
+            return Decision((answers + normal @ spread).astype(np.float32), answers)
+
+        return act
+
+    def queries(self, episodes: int, horizon: int) -> dict[str, int]:
+        """One row for each step, those of the extra episodes too."""
+        extra = self.extra * (len(self.rounds(episodes)) - 1)
+        return {"act": (episodes + extra) * horizon, "label": 0}
+
+    def _spread(self, situation: Situation, student: Policy) -> np.ndarray:
+        """Return the (m, m) square root of the noise's covariance."""
+        episodes = situation.record(_expert_acts(situation.expert), self.extra)
+        states = episodes.observations[episodes.valid]
+        errors = (student(states) - episodes.actions[episodes.valid]).astype(np.float64)
+        covariance = errors.T @ errors / len(errors)
+        if self.alpha > 0 and np.trace(covariance) > 0:
+            covariance *= self.alpha / (episodes.valid.shape[1] * np.trace(covariance))
+        # By eigenvalues, since a student that equals its expert somewhere makes it singular.
+        values, vectors = np.linalg.eigh(covariance)
+        return (vectors * np.sqrt(np.maximum(values, 0))) @ vectors.T
+
+
+def _expert_acts(expert: Expert) -> Behaviour:
+    def act(observations: np.ndarray, noise: Sequence[np.random.Generator]) -> Decision:
+        answers = expert.ask(observations, "act")
+        return Decision(answers, answers)
+
+    return act
+
+
+def _blend(
+    expert: np.ndarray, student: np.ndarray, share: float, noise: Sequence[np.random.Generator]
+) -> np.ndarray:
+    return (share * expert + (1 - share) * student).astype(np.float32)
+
+
+def _switch(
+    expert: np.ndarray, student: np.ndarray, share: float, noise: Sequence[np.random.Generator]
+) -> np.ndarray:
+    heads = np.array([random.random() < share for random in noise])
+    return np.where(heads[:, None], expert, student)
+
+
+def _between(updates: Sequence[int], episodes: int) -> list[int]:
+    ends = [update for update in updates if update < episodes] + [episodes]
+    return [end - start for start, end in zip([0, *ends], ends, strict=False)]
+
+
+def _check_updates(updates: Sequence[int]) -> None:
+    ascending = all(a < b for a, b in zip([0, *updates], updates, strict=False))
+    if not ascending or not all(isinstance(update, int) for update in updates):
+        raise SettingError(
+            f"updates={updates!r}",
+            "increasing numbers of episodes",
+            "write updates=(1, 5, 20, 30)",
+        )
+
+
+def _check_share(share: float) -> float:
+    if not isinstance(share, Real) or not 0 <= share <= 1:
+        raise SettingError(f"beta gives {share!r}", "a share from 0 to 1", "write beta=0.5")
+    return share
+
+
+TRAINERS: dict[str, Callable[[], Trainer]] = {
+    "bc": BehaviourCloning,
+    "dagger": DAgger,
+    "dart": Dart,
+}
+
+
+def describe_trainer(trainer: Trainer) -> str:
+    """Return a trainer's name, and its settings where they are not the usual ones."""
+    fields = vars(trainer).items()
+    usual = vars(TRAINERS[trainer.name]()) if trainer.name in TRAINERS else {}
+    odd = [
+        f"{name}={getattr(value, '__name__', value)}"
+        for name, value in fields
+        if usual.get(name) != value
+    ]
+    return ",".join([trainer.name, *odd])
+
+
+def trainer_of(trainer: str | Trainer) -> Trainer:
+    """Return the trainer of that name, or the trainer itself.
+
+    Raises:
+        SettingError: If there is none of that name.
+    """
+    if not isinstance(trainer, str):
+        return trainer
+    if trainer not in TRAINERS:
+        known = ", ".join(TRAINERS)
+        raise SettingError(f"trainer={trainer!r}", f"one of {known}", "choose one of these")
+    return TRAINERS[trainer]()

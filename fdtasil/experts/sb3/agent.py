@@ -1,0 +1,156 @@
+"""Reading an agent: one torch module from raw observations to actions in environment units."""
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import ArrayLike
+from torch import nn
+
+from fdtasil.errors import ExpertError, SettingError
+from fdtasil.experts.sb3.archive import Archive, read_archive
+from fdtasil.experts.sb3.network import Clip, Normalise, Rescale, build_network
+from fdtasil.experts.sb3.recipes import Recipe, check_policy, find_recipe, read_activation
+from fdtasil.experts.sb3.spaces import Bounds, given_bounds, read_bounds, read_size
+from fdtasil.experts.sb3.statistics import VecNormalizePath, read_statistics
+from fdtasil.experts.sb3.trust import TRUST, Trust, check_trust
+
+__all__ = ["Agent", "read_agent"]
+
+
+@dataclass(frozen=True)
+class Agent:
+    """A trained agent of stable-baselines3.
+
+    Attributes:
+        algorithm: "SAC", "TD3", "DDPG", "TQC", "PPO", "A2C" or "TRPO".
+        observation_size: n.
+        action_low: (m,) float32, lower action bounds in environment units.
+        action_high: (m,) float32, upper bounds.
+        module: (B, n) float32 raw observations -> (B, m) float32 actions in environment units,
+            what `agent.predict(observations, deterministic=True)` returns.
+        source: The zip.
+        sha256: Of the zip.
+        library_version: Version of stable-baselines3 that wrote it, or "unknown".
+        statistics_sha256: Of the VecNormalize file whose statistics are in `module`, or None.
+    """
+
+    algorithm: str
+    observation_size: int
+    action_low: np.ndarray
+    action_high: np.ndarray
+    module: nn.Module
+    source: Path
+    sha256: str
+    library_version: str
+    statistics_sha256: str | None
+
+
+def read_agent(
+    path: str | Path,
+    *,
+    trust: Trust = None,
+    vecnormalize: VecNormalizePath = None,
+    action_low: ArrayLike | None = None,
+    action_high: ArrayLike | None = None,
+) -> Agent:
+    """Read an agent that stable-baselines3 saved, since its version 0.6, without unpickling.
+
+    Args:
+        path: The zip of a SAC, TD3, DDPG, TQC, PPO, A2C or TRPO agent with an MLP policy; its
+            ".zip" may be left out, as in stable-baselines3.
+        trust: "pickle" to have stable-baselines3 load what can't be read otherwise: gSDE, custom
+            policies, feature extractors and activations, and the statistics of VecNormalize. That
+            runs any code that is in such a file.
+        vecnormalize: The file with the statistics of VecNormalize that the agent was trained
+            with, which becomes part of the module; False where there are none, although a file
+            beside the zip looks like them.
+        action_low: (m,) or one number, instead of the bounds that the zip has as text.
+        action_high: (m,) or one number; given together with `action_low`.
+
+    Returns:
+        The agent.
+
+    Raises:
+        ExpertError: If the zip is damaged, is not such an agent, or can't be read without trust.
+        SettingError: If an argument has a value that can't be used.
+
+    Example::
+
+        agent = read_agent("agents/HalfCheetah-v5.zip")
+        actions = agent.module(torch.from_numpy(observations))
+    """
+    check_trust(trust)
+    path = _find(path)
+    archive = read_archive(path)
+    check_policy(archive.record, str(path))
+    n, m = (
+        read_size(archive.record, f"{kind}_space", str(path)) for kind in ("observation", "action")
+    )
+    recipe = find_recipe(archive.record, str(path))
+    given = given_bounds(action_low, action_high, m)
+    statistics, statistics_sha256 = read_statistics(path, vecnormalize, n, trust)
+    network, squashed, bounds = _read_network(archive, recipe, (n, m), given, trust)
+    _check_bounds(bounds, squashed, str(path))
+    parts: list[nn.Module] = [network, Rescale(bounds) if squashed else Clip(bounds)]
+    if statistics is not None:
+        parts.insert(0, Normalise(statistics))
+    return Agent(
+        recipe.algorithm,
+        n,
+        bounds.low,
+        bounds.high,
+        nn.Sequential(*parts).eval().requires_grad_(False),
+        path,
+        archive.sha256,
+        archive.library_version(),
+        statistics_sha256,
+    )
+
+
+def _find(path: str | Path) -> Path:
+    if not isinstance(path, (str, Path)):
+        raise SettingError(
+            f"an agent of type {type(path).__name__}",
+            "the path of a zip",
+            'save it first: agent.save("agent.zip"); distill(agent, env) takes the agent itself',
+        )
+    path = Path(path)
+    return path.with_suffix(".zip") if not path.suffix and not path.exists() else path
+
+
+def _read_network(
+    archive: Archive, recipe: Recipe, sizes: tuple[int, int], given: Bounds | None, trust: Trust
+) -> tuple[nn.Module, bool, Bounds]:
+    """Return the network, whether its actions are to be rescaled, and the bounds.
+
+    Trust in statistics, which always need it, is no reason to run code of a zip that needs none.
+    """
+    try:
+        return _rebuilt(archive, recipe, sizes, given)
+    except ExpertError as refusal:
+        if trust is None or refusal.next_step != TRUST:
+            raise
+    from fdtasil.experts.sb3.trusted import unpickle_agent
+
+    network, squashed, bounds = unpickle_agent(archive, recipe, sizes)
+    return network, squashed, given or bounds
+
+
+def _rebuilt(
+    archive: Archive, recipe: Recipe, sizes: tuple[int, int], given: Bounds | None
+) -> tuple[nn.Module, bool, Bounds]:
+    source = str(archive.path)
+    activation = read_activation(archive.record, recipe, source)
+    bounds = given or read_bounds(archive.record, sizes[1], source)
+    network = build_network(archive.weights(), recipe, activation, sizes, source)
+    return network, recipe.squashed, bounds
+
+
+def _check_bounds(bounds: Bounds, squashed: bool, source: str) -> None:
+    if squashed and not np.isfinite([bounds.low, bounds.high]).all():
+        raise ExpertError(
+            f"{source}: action bounds {bounds.low} to {bounds.high}",
+            "finite bounds, to which this policy's tanh is scaled",
+            "write action_low=env.action_space.low, action_high=env.action_space.high",
+        )

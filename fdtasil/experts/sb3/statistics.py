@@ -1,0 +1,100 @@
+"""The VecNormalize statistics that an agent was trained with: found, read with trust, checked."""
+
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from fdtasil.errors import ExpertError, SettingError
+from fdtasil.experts.sb3.archive import read_file
+from fdtasil.experts.sb3.network import ObservationStatistics
+from fdtasil.experts.sb3.trust import Trust
+from fdtasil.files.storage import sha256
+
+__all__ = ["VecNormalizePath", "read_statistics"]
+
+VecNormalizePath = str | Path | Literal[False] | None
+
+
+def read_statistics(
+    agent: Path, given: VecNormalizePath, observation_size: int, trust: Trust
+) -> tuple[ObservationStatistics | None, str | None]:
+    """Read what an agent's observations are normalised with.
+
+    Args:
+        agent: The zip, for a look at what lies beside it.
+        given: The file, False (or the word "False", as a shell says it) where there is none, or
+            None where nothing was said.
+        observation_size: n.
+        trust: Must be "pickle" where there is a file.
+
+    Returns:
+        The statistics and the sha256 of their file; None, None where nothing is normalised.
+
+    Raises:
+        ExpertError: If the file needs trust, can't be used, belongs to another agent, or was not
+            given although it lies beside the zip.
+        SettingError: If `given` is no path.
+    """
+    if given in (False, "False"):
+        return None, None
+    if given is None:
+        _check_neighbours(agent)
+        return None, None
+    if not isinstance(given, (str, Path)):
+        raise SettingError(f"vecnormalize={given!r}", "a path, or False", "name the file")
+    file = Path(given)
+    data = read_file(file)
+    if trust != "pickle":
+        raise ExpertError(
+            f"{file} is a Python pickle, which runs any code when it is opened",
+            "a file that you trust",
+            'if you do, write trust="pickle" (--trust pickle on the command line)',
+        )
+    from fdtasil.experts.sb3.trusted import unpickle_statistics
+
+    statistics = unpickle_statistics(file, data)
+    if statistics is None:
+        return None, None
+    _check(statistics, observation_size, file)
+    return statistics, sha256(data)
+
+
+def _check_neighbours(agent: Path) -> None:
+    """Refuse to leave out statistics that lie where stable-baselines3's tools put them."""
+    found = _neighbours(agent)
+    if not found:
+        return
+    more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
+    command = f"fdtasil export-sb3 {agent} --out {agent.stem}.onnx --vecnormalize"
+    raise ExpertError(
+        f"{found[0]}{more} lies beside {agent.name} and looks like its observation statistics",
+        f'vecnormalize="{found[0]}" and trust="pickle", or vecnormalize=False',
+        f"{command} {found[0]} --trust pickle (or --vecnormalize False), then use the ONNX file",
+    )
+
+
+def _neighbours(agent: Path) -> list[Path]:
+    # The hub and users save vec_normalize.pkl, callbacks ..._vecnormalize_..._steps.pkl.
+    found = set(agent.parent.glob("*vec*norm*.pkl"))
+    # rl-zoo writes <environment>/vecnormalize.pkl with its settings; any other folder below may
+    # belong to any other agent.
+    for file in agent.parent.glob("*/vecnormalize.pkl"):
+        if file.parent.name == agent.stem or (file.parent / "config.yml").exists():
+            found.add(file)
+    # Of the checkpoints ..._1000_steps, ..._2000_steps the one of the same step comes first.
+    return sorted(
+        found, key=lambda file: (file.stem.replace("vecnormalize_", "") != agent.stem, file)
+    )
+
+
+def _check(statistics: ObservationStatistics, observation_size: int, source: Path) -> None:
+    arrays = (statistics.mean, statistics.scale)
+    shapes = [array.shape for array in arrays]
+    finite = all(np.isfinite(array).all() for array in arrays)
+    if shapes != [(observation_size,)] * 2 or not finite or not (statistics.scale > 0).all():
+        raise ExpertError(
+            f"{source} has statistics of shape {shapes[0]}",
+            f"({observation_size},) finite numbers, as the agent's observations",
+            "check that the two files belong together",
+        )

@@ -1,0 +1,111 @@
+"""Writing a torch policy as one ONNX file, and comparing the two."""
+
+import logging
+import warnings
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
+from typing import TYPE_CHECKING
+
+import numpy as np
+import torch
+
+from fdtasil.errors import ExportError, first_line
+from fdtasil.files.onnx.session import open_session, run_session
+
+if TYPE_CHECKING:
+    import onnx
+
+
+_OPSET = 18  # old enough for the runtimes on robots, new enough for torch's exporter
+
+
+def export_module(
+    module: torch.nn.Module, observations: np.ndarray, metadata: Mapping[str, str]
+) -> bytes:
+    """Write a torch policy as one self-contained ONNX file, and compare the two.
+
+    The graph has one input `obs` (batch, n), one output `actions` (batch, m), both float32, and
+    a free batch. Equal modules give equal bytes.
+
+    Args:
+        module: (B, n) -> (B, m) float32, put into evaluation mode while it is exported.
+        observations: (B, n) float32 real states to compare on; B at least 2.
+        metadata: Text entries of the file's `metadata_props`.
+
+    Returns:
+        The file's bytes.
+
+    Raises:
+        ExportError: If the export fails, an answer is not finite, or the file's answers differ
+            from torch's by more than 1e-5 (relative to the largest action, if that is over 1).
+    """
+    import onnx
+
+    example = torch.from_numpy(np.ascontiguousarray(observations, np.float32))
+    training = module.training
+    module.eval()
+    try:
+        model = _export_graph(module, example)
+        with torch.no_grad():
+            expected = module(example).numpy()
+    finally:
+        module.train(training)
+    onnx.helper.set_model_props(model, dict(metadata))
+    session = open_session(model, "the export")
+    answers = run_session(session, "actions", example.numpy())
+    if not all(torch.isfinite(weights).all() for weights in module.parameters()):
+        raise ExportError(  # an infinite one may hide behind a tanh
+            f"{type(module).__name__} has weights that are not finite",
+            "finite numbers",
+            "train it again: it did not learn what it answers",
+        )
+    difference = float(np.abs(answers - expected).max())
+    if not difference <= 1e-5 * max(1.0, float(np.abs(expected).max())):  # catches NaN as well
+        raise ExportError(
+            f"the ONNX file and torch differ by {difference:.1e} on {len(example)} states",
+            "at most 1e-5, on finite answers",
+            "check the module for layers that behave differently in training, or for NaN weights",
+        )
+    return model.SerializeToString(deterministic=True)
+
+
+def _export_graph(module: torch.nn.Module, example: torch.Tensor) -> "onnx.ModelProto":
+    try:
+        with _silenced():
+            program = torch.onnx.export(
+                module,
+                (example[:2],),
+                dynamo=True,
+                external_data=False,
+                opset_version=_OPSET,
+                input_names=["obs"],
+                output_names=["actions"],
+                dynamic_shapes=({0: torch.export.Dim("batch")},),
+                verbose=False,
+            )
+        assert program is not None  # for the type checker: dynamo=True always returns one
+        model = program.model_proto
+    except Exception as error:
+        raise ExportError(
+            f"torch can't export {type(module).__name__}: {first_line(error)}",
+            "a module made of operations that ONNX has",
+            "replace the operation named above",
+        ) from error
+    # The exporter writes stack traces with folder names of this machine into every node.
+    for part in (*model.graph.node, *model.graph.value_info, model.graph, *model.functions):
+        del part.metadata_props[:]
+        part.doc_string = ""
+    return model
+
+
+@contextmanager
+def _silenced() -> Iterator[None]:
+    """Keep the exporter's remarks about its own internals away from the user."""
+    before = logging.root.manager.disable
+    logging.disable(logging.WARNING)
+    try:
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            yield
+    finally:
+        logging.disable(before)

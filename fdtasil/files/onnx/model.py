@@ -1,0 +1,101 @@
+"""Reading an ONNX file with its weights: nothing outside its folder, no code of it is run."""
+
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from fdtasil.errors import ExpertError
+from fdtasil.files.onnx.side_files import load_side_files, names_of_side_files
+from fdtasil.files.storage import sha256
+
+if TYPE_CHECKING:
+    import onnx
+
+__all__ = ["read_model", "side_files"]
+
+# Bytes, with the side files; a protobuf message can't have more than twice that.
+_SIZE_LIMIT = 2**30
+
+_ENDS = (".zip", ".onnx")  # which stable-baselines3 and users leave out
+_IMPOSTORS = {
+    b"<": ("an HTML or XML page", "download the file itself, not the page about it"),
+    b"version https://git-lfs": ("a git-LFS pointer", "run `git lfs pull`"),
+    b"\x80": ("a Python pickle", "export the controller to ONNX; pickles are never opened"),
+    b"PK\x03\x04": (
+        "a zip; if stable-baselines3 wrote it, it is an agent and not a model",
+        "name it *.zip, or export it with `fdtasil export-sb3`",
+    ),
+}
+
+
+def read_model(path: Path) -> "tuple[onnx.ModelProto, str]":
+    """Read an ONNX file with its weights, also where they lie in a side file.
+
+    Nothing outside the model's own folder is read, no link to a side file is followed, and no code
+    of the file is run.
+
+    Returns:
+        The model, and the sha256 of its file (followed by its side files, where it has any).
+
+    Raises:
+        ExpertError: If it is missing, not ONNX, over 1 GiB, or a side file of it can't be used.
+    """
+    import onnx
+
+    path = Path(path)
+    data = _read_bytes(path)
+    for magic, (found, next_step) in _IMPOSTORS.items():
+        if data.startswith(magic):
+            raise ExpertError(f"{path} is {found}", "an ONNX model", next_step)
+    model = None
+    try:
+        model = onnx.load_model_from_string(data)
+        data += load_side_files(model, path, _SIZE_LIMIT - len(data))
+    except ExpertError:
+        raise
+    except Exception:  # damaged bytes may raise anything
+        model = None
+    if model is None or not model.graph.node:
+        raise ExpertError(
+            f"{path} is no whole ONNX model ({len(data):,} bytes)",
+            "a file written by an ONNX exporter",
+            "copy or export it again",
+        )
+    return model, sha256(data)
+
+
+def side_files(data: bytes) -> set[str]:
+    """Return the side files that a model's bytes name, unchecked; none where they are no model."""
+    import onnx
+
+    try:
+        return names_of_side_files(onnx.load_model_from_string(data))
+    except Exception:  # `read_model` says what they are instead
+        return set()
+
+
+def _read_bytes(path: Path) -> bytes:
+    if path.is_dir():
+        inside = ", ".join(sorted(p.name for p in path.glob("*.onnx"))[:5]) or "none"
+        raise ExpertError(
+            f"{path} is a folder (ONNX files inside: {inside})",
+            "an ONNX file",
+            "name the file itself",
+        )
+    try:
+        size = path.stat().st_size
+        if not 0 < size <= _SIZE_LIMIT:
+            raise ExpertError(
+                f"{path} has {size:,} bytes",
+                f"1 to {_SIZE_LIMIT:,} bytes",
+                "check that this is the right file",
+            )
+        return path.read_bytes()
+    except OSError as error:
+        beside = [
+            p.name for p in (path.with_name(f"{path.name}{end}") for end in _ENDS) if p.exists()
+        ]
+        raise ExpertError(
+            f"{path.absolute()} can't be read: {error.strerror}",
+            f"an ONNX file (relative paths start at {Path.cwd()})",
+            f"name it whole: {beside[0]}" if beside else "check the path",
+        ) from error

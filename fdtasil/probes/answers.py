@@ -1,0 +1,241 @@
+"""The expert's answers around demonstrated states: asked in bounded blocks, kept in one array."""
+
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from fdtasil.errors import ExpertError, FdtasilWarning, SettingError
+from fdtasil.experts.expert import Expert, Purpose
+from fdtasil.probes.derivatives import differentiate
+from fdtasil.probes.scales import Scales
+from fdtasil.probes.source import Probes
+
+__all__ = ["UNFOLLOWED", "Answers", "Asking", "ask_moved", "ask_probes"]
+
+# States that a design is shown: enough to tell which displacements can occur.
+_SHOWN = 4096
+# Points asked at once: as quick as more for an onnxruntime session, and of an expert that takes
+# 50 ms a row no more than a minute is lost.
+_ROWS = 2**10
+_MUCH = 2**30  # bytes of answers that are announced before they are asked
+_ROUNDED = 0.1  # share of a step that rounding may take before it is warned of
+
+
+@dataclass(frozen=True)
+class Answers:
+    """What the expert said around each state.
+
+    Attributes:
+        displacements: (P, n) float32 bank of displacements in raw observation units; for an
+            exact stencil the directions that were differentiated along.
+        numbers: (N, k) int32, the rows of the bank that each state was probed along.
+        values: (N, k, p, m) float32 expert actions at state + offset * displacement for each of
+            the stencil's p offsets; for an exact stencil they are the p first derivatives.
+        gain: What turns a difference of values into the whitened Jacobian's Frobenius norm,
+            in expectation over directions: sqrt(d) / step; 1 where values are matched as labels.
+    """
+
+    displacements: np.ndarray
+    numbers: np.ndarray
+    values: np.ndarray
+    gain: float
+
+    def __add__(self, other: "Answers") -> "Answers":
+        """Join the answers of two rounds; the gain is the later one's.
+
+        A coordinate may begin to move in a later round, and a basis is longer by it then: states
+        with fewer probes have some of them twice.
+        """
+        count = max(self.numbers.shape[1], other.numbers.shape[1])
+        ours, theirs = (np.arange(count) % one.numbers.shape[1] for one in (self, other))
+        later = other.numbers[:, theirs] + len(self.displacements)
+        return Answers(
+            np.concatenate([self.displacements, other.displacements]),
+            np.concatenate([self.numbers[:, ours], later]),
+            np.concatenate([self.values[:, ours], other.values[:, theirs]]),
+            other.gain,
+        )
+
+
+@dataclass(frozen=True)
+class Asking:
+    """How an asking that takes long is followed, and goes on.
+
+    Attributes:
+        known: (S, k, p, m) what an interrupted asking had of the first S states, or None.
+        told: Given the (S, k, p, m) answers so far and how many states of them are new.
+    """
+
+    known: np.ndarray | None = None
+    told: Callable[[np.ndarray, int], None] = lambda values, states: None
+
+
+UNFOLLOWED = Asking()
+
+
+def ask_probes(
+    expert: Expert,
+    observations: np.ndarray,
+    probes: Probes,
+    scales: Scales,
+    random: np.random.Generator,
+    order: int = 1,
+    asking: Asking = UNFOLLOWED,
+) -> Answers:
+    """Ask the expert around each state.
+
+    Args:
+        expert: Who is asked; differentiated instead, if the stencil is exact.
+        observations: (N, n) float32 states.
+        probes: The derivative source, with radius and space set.
+        scales: Of the demonstrations.
+        random: Draws the directions.
+        order: 1, or 2 for exact second derivatives too; a finite stencil has them in its values.
+        asking: Who follows it; nobody does where derivatives are exact.
+
+    Raises:
+        ExpertError: If the stencil is exact and the expert can't be differentiated.
+        SettingError: If no coordinate moves, a step is lost in rounding or beyond float32, or
+            the answers do not fit into memory.
+    """
+    try:
+        return _ask_probes(expert, observations, probes, scales, random, order, asking)
+    except MemoryError as error:
+        raise SettingError(
+            f"{probes.describe()!r} at {len(observations):,} states does not fit into memory",
+            "answers that do",
+            "pass fewer probes: they teach alike",
+        ) from error
+
+
+def ask_moved(expert: Expert, points: np.ndarray, purpose: Purpose) -> np.ndarray:
+    """Ask an expert about states that were moved, and say so where it can't answer.
+
+    Raises:
+        ExpertError: As `Expert.ask`.
+    """
+    try:
+        return expert.ask(points, purpose)
+    except ExpertError as error:
+        raise ExpertError(
+            f"{error.found} (states moved by probes)",
+            error.expected,
+            f"{error.next_step}; probes leave the bounds of the observations, so it must answer "
+            "there as well, or the radius be smaller",
+        ) from error
+
+
+def _ask_probes(
+    expert: Expert,
+    observations: np.ndarray,
+    probes: Probes,
+    scales: Scales,
+    random: np.random.Generator,
+    order: int,
+    asking: Asking,
+) -> Answers:
+    deviation = 1.0 if probes.space == "raw" else scales.deviation
+    step_scale = np.where(scales.probed(probes.space), deviation, 0.0)
+    live = np.flatnonzero(step_scale)
+    assert probes.radius is not None, "the preset sets the radius"
+    assert probes.stencil is not None, "the order sets the stencil"
+    reach = 1.0 if probes.space == "raw" else probes.directions.reach(len(live))
+    step = 1.0 if probes.stencil.exact else probes.radius * reach
+    shown = np.linspace(0, len(observations) - 1, min(len(observations), _SHOWN)).astype(int)
+    states = observations[shown][:, live] / (step * step_scale[live])
+    bank, numbers = probes.directions.draw(len(observations), states, random)
+    displacements = np.zeros((len(bank), len(step_scale)), np.float32)
+    with np.errstate(over="ignore"):  # looked at in the next line
+        displacements[:, live] = step * bank * step_scale[live]
+    _check_steps(displacements, observations, probes)
+    gain = len(live) ** 0.5 / step if probes.stencil.differences else 1.0
+    if probes.stencil.exact:
+        values = differentiate(expert, observations, displacements, numbers, order)
+    else:
+        offsets = probes.stencil.offsets
+        values = _ask_values(expert, observations, displacements, numbers, offsets, asking)
+    return Answers(displacements, numbers, values, gain)
+
+
+def _ask_values(
+    expert: Expert,
+    observations: np.ndarray,
+    displacements: np.ndarray,
+    numbers: np.ndarray,
+    offsets: Sequence[float],
+    asking: Asking,
+) -> np.ndarray:
+    """Ask for the values at the stencil's points, a bounded number of rows at a time."""
+    states, count = numbers.shape
+    block = max(1, _ROWS // (count * len(offsets)))
+    shifts = np.asarray(offsets, np.float32)[:, None]
+    values, done = None, 0
+    if asking.known is not None:
+        done = len(asking.known)
+        values = np.empty((states, *asking.known.shape[1:]), np.float32)
+        values[:done] = asking.known
+        asking.told(values[:done], done)
+    for start in range(done, states, block):
+        rows = slice(start, start + block)
+        moved = displacements[numbers[rows]][:, :, None, :] * shifts
+        points = observations[rows, None, None, :] + moved
+        _check_moved(points, observations[rows], displacements)
+        answers = ask_moved(expert, points.reshape(-1, points.shape[-1]), "probe")
+        if values is None:  # the first block says how long an action is
+            values = np.empty((states, count, len(offsets), answers.shape[1]), np.float32)
+            _announce(values)
+        values[rows] = answers.reshape(*points.shape[:3], -1)
+        asking.told(values[: start + len(points)], len(points))
+    assert values is not None, "there is no demonstration without a state"
+    return values
+
+
+def _announce(values: np.ndarray) -> None:
+    """Say what the answers take where that is much; the memory is not touched yet."""
+    if values.nbytes > _MUCH:
+        warnings.warn(
+            f"the expert's answers, {values.shape[0]:,} states x {values.shape[1]} probes, take "
+            f"{values.nbytes / 2**30:.1f} GiB of memory; fewer probes take less and teach alike",
+            FdtasilWarning,
+            stacklevel=4,
+        )
+
+
+def _check_steps(displacements: np.ndarray, observations: np.ndarray, probes: Probes) -> None:
+    """Refuse steps that float32 can't hold beside the states, and warn of those that it rounds."""
+    squares = displacements.astype(np.float64) ** 2
+    sizes = np.sqrt(squares.sum(axis=0) / np.maximum(np.count_nonzero(squares, axis=0), 1))
+    wide = np.abs(displacements).max() + np.abs(observations).max()
+    if not np.isfinite(wide) or not sizes.any():
+        raise SettingError(
+            f"radius={probes.radius:g} moves a state by {sizes.max():g}",
+            "steps that float32 can add to the observations",
+            "leave radius= out, or write for example radius=0.3",
+        )
+    if probes.exact:
+        return
+    values = np.sqrt((observations.astype(np.float64) ** 2).mean(axis=0)).astype(np.float32)
+    errors = np.spacing(values) / 12**0.5  # root mean square, of rounding to the nearest
+    shares = np.where(sizes > 0, errors / np.where(sizes > 0, sizes, 1), 0)
+    worst = int(shares.argmax())
+    if shares[worst] > _ROUNDED:
+        warnings.warn(
+            f"float32 rounds away {min(1.0, shares[worst]):.0%} of the step along coordinate "
+            f"{worst}, of {sizes[worst]:.2g} beside values of {values[worst]:.2g}: raise the "
+            "radius, or probe in whitened space",
+            FdtasilWarning,
+            stacklevel=4,
+        )
+
+
+def _check_moved(points: np.ndarray, centres: np.ndarray, displacements: np.ndarray) -> None:
+    still = (points == centres[:, None, None, :]).all(axis=-1)
+    if still.any() and displacements.any(axis=1).all():
+        raise SettingError(
+            f"{still.sum()} of {still.size} probes do not move the state: float32 rounds the "
+            "step away",
+            "a radius above the rounding of the observations",
+            "raise the radius, or probe in whitened space",
+        )

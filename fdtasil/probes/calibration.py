@@ -1,0 +1,202 @@
+"""How far to probe: what an expert's answers look like at many distances, asked once."""
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Literal
+
+import numpy as np
+
+from fdtasil.errors import FdtasilWarning
+from fdtasil.experts.expert import Expert
+from fdtasil.probes.answers import ask_moved
+from fdtasil.probes.scales import Scales
+from fdtasil.probes.source import Probes
+from fdtasil.probes.stencils import CENTRAL, FORWARD
+
+__all__ = ["Calibration", "Ladder", "calibrate", "ladder_for"]
+
+
+@dataclass(frozen=True)
+class Ladder:
+    """The radii that a calibration asks at, on both sides of some states.
+
+    Attributes:
+        rays: Number of states, one direction each.
+        steps: Number of radii: 1, 1/4, 1/16 ... standard deviations of each coordinate.
+    """
+
+    rays: int
+    steps: int
+
+    @property
+    def radii(self) -> np.ndarray:
+        """(steps,) ascending."""
+        return 4.0 ** np.arange(1 - self.steps, 1)
+
+    @property
+    def queries(self) -> int:
+        """Rows asked."""
+        return self.rays * (2 * self.steps + 1)
+
+
+_WHOLE, _SHORT = Ladder(rays=48, steps=10), Ladder(rays=16, steps=6)  # 1,008 and 208 rows
+_DEAR = 10_000  # probe rows of a run below which the short ladder is long enough
+# Differences at a radius and at a quarter of it point the same way where a derivative exists:
+# smooth experts reach 0.85 and more somewhere, trees and quantised networks stay below 0.5.
+_COHERENT = 0.75
+# Similarity at the radius that is used, below which jumps or kinks rule there, and a difference
+# over both sides teaches better. Networks have 0.70 to 0.94, a bang-bang law and a sampling
+# controller, which are smooth at most states, 0.5, trees and int8 less.
+_ROUGH = 0.62
+_ROUGH_RADIUS = 0.5
+_NOISY_FROM = 4.0**-6  # smallest radius with a derivative; float32 rounding stays below it
+_NOISY_SHARE = 0.3  # of noise in a difference; above it a given radius is warned of
+_FAR = 4.0  # standard deviations beyond which no demonstrated state lies, and none was asked about
+
+
+def ladder_for(probe_rows: int) -> Ladder:
+    """Return the ladder for a run that asks that many probes: about a tenth of them at most."""
+    return _SHORT if probe_rows < _DEAR else _WHOLE
+
+
+@dataclass(frozen=True)
+class Calibration:
+    """What the ladder of radii says of an expert.
+
+    Attributes:
+        regime: "smooth", "noisy" (a derivative exists above a noise that differences at small
+            radii show), or "steps" (no radius has one).
+        noise_floor: Root mean square error of an action, from second differences at the smallest
+            radius, where nothing but rounding and noise is left of them.
+        radius: Suggested, in standard deviations of each coordinate.
+        stencil: Suggested, "forward" or "central".
+        similarity: Secant similarity at each radius and a quarter of it; the first is NaN.
+        change: Root mean square change of an action at each radius.
+        radii: The radii, ascending.
+        queries: Rows asked.
+    """
+
+    regime: Literal["smooth", "noisy", "steps"]
+    noise_floor: float
+    radius: float
+    stencil: str
+    similarity: tuple[float, ...]
+    change: tuple[float, ...]
+    radii: tuple[float, ...]
+    queries: int
+
+    def complete(self, probes: Probes) -> Probes:
+        """Return the source with what it leaves open filled in; warn of a radius that misleads."""
+        radius = self.radius if probes.radius is None else probes.radius
+        if probes.radius is not None and probes.space == "whitened":
+            self._warn_of(probes.radius)
+        stencil = CENTRAL if self.stencil == "central" else FORWARD
+        return replace(probes, radius=radius, stencil=probes.stencil or stencil)
+
+    def similarity_at(self, radius: float) -> float:
+        """Return the similarity at a radius, interpolated between the rungs of the ladder."""
+        return float(np.interp(np.log(radius), np.log(self.radii[1:]), self.similarity[1:]))
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the calibration as plain JSON values."""
+        plain = {name: list(v) if isinstance(v, tuple) else v for name, v in vars(self).items()}
+        return plain | {"similarity": [None, *self.similarity[1:]]}
+
+    @classmethod
+    def from_json(cls, fields: Mapping[str, Any]) -> "Calibration":
+        """Read what `to_json` returned."""
+        lists = {name: tuple(value) for name, value in fields.items() if isinstance(value, list)}
+        similarity = (float("nan"), *fields["similarity"][1:])
+        return cls(**{**fields, **lists, "similarity": similarity})
+
+    def _warn_of(self, radius: float) -> None:
+        change = float(np.interp(np.log(radius), np.log(self.radii), self.change))
+        change *= min(1.0, radius / self.radii[0])  # linear, nearer than anything that was asked
+        noise = 2**0.5 * self.noise_floor
+        coherent, best = self.similarity_at(radius), self.similarity_at(self.radius)
+        reason = None
+        if self.regime != "steps" and noise > _NOISY_SHARE * change:
+            reason = f"{min(1.0, noise / change):.0%} of a difference there is noise"
+        elif coherent < 0.5 * best:
+            reason = f"differences there and at a quarter of it agree to {coherent:.2f} only"
+        elif radius > _FAR:
+            reason = "no demonstrated state lies that far from the others"
+        if reason is not None:
+            warnings.warn(
+                f"radius={radius:g}: {reason}; the calibration suggests {self.radius:.2g} "
+                f"(agreement {best:.2f}), which leaving radius= out takes",
+                FdtasilWarning,
+                stacklevel=2,
+            )
+
+
+def calibrate(
+    expert: Expert,
+    observations: np.ndarray,
+    scales: Scales,
+    random: np.random.Generator,
+    usual: float,
+    ladder: Ladder = _WHOLE,
+) -> Calibration:
+    """Ask an expert at a ladder of radii on both sides of some states.
+
+    Args:
+        expert: The expert.
+        observations: (N, n) states of the environment.
+        scales: Of these states.
+        random: Draws states and directions.
+        usual: The radius that teaches best where the expert allows it.
+        ladder: How much is asked.
+    """
+    rays, radii = ladder.rays, ladder.radii
+    rows = random.choice(len(observations), size=rays, replace=len(observations) < rays)
+    live = scales.probed("whitened")
+    scale = np.where(live, scales.deviation, 0.0)
+    normal = random.standard_normal((rays, len(scale))) * live
+    directions = scale * normal / np.linalg.norm(normal, axis=1, keepdims=True) * live.sum() ** 0.5
+    signs = np.array([1.0, -1.0])[None, None, :, None]
+    moved = directions[:, None, None, :] * radii[None, :, None, None] * signs
+    points = (observations[rows][:, None, None, :] + moved).astype(np.float32)
+    centres = expert.ask(observations[rows], "calibrate").astype(np.float64)
+    answers = ask_moved(expert, points.reshape(-1, len(scale)), "calibrate")
+    values = answers.reshape(rays, len(radii), 2, -1).astype(np.float64)
+    secants = (values[:, :, 0] - values[:, :, 1]) / (2 * radii[None, :, None])
+    similarity = _similarity(secants[:, 1:], secants[:, :-1])
+    second = values[:, 0, 0] + values[:, 0, 1] - 2 * centres
+    floor = float(np.sqrt((second**2).mean() / 6))
+    change = np.sqrt(((values - centres[:, None, None, :]) ** 2).mean(axis=(0, 2, 3)))
+    regime, radius, stencil = _judge(similarity, radii[1:], usual)
+    return Calibration(
+        regime,
+        floor,
+        radius,
+        stencil,
+        (float("nan"), *similarity.tolist()),
+        tuple(change.tolist()),
+        tuple(radii.tolist()),
+        ladder.queries,
+    )
+
+
+def _similarity(wide: np.ndarray, narrow: np.ndarray) -> np.ndarray:
+    """Return the mean over rays of 2 <a, b> / (|a|^2 + |b|^2), one number for each radius."""
+    both = (wide**2).sum(axis=-1) + (narrow**2).sum(axis=-1)
+    product = 2 * (wide * narrow).sum(axis=-1)
+    return np.where(both > 0, product / np.where(both > 0, both, 1), 0.0).mean(axis=0)
+
+
+def _judge(
+    similarity: np.ndarray, radii: np.ndarray, usual: float
+) -> tuple[Literal["smooth", "noisy", "steps"], float, str]:
+    """Return regime, radius and stencil from the similarity at each radius but the smallest."""
+    coherent = np.flatnonzero(similarity >= _COHERENT)
+    if not len(coherent) or radii[coherent[-1]] < 1e-3:
+        return "steps", max(usual, _ROUGH_RADIUS), "central"
+    # The kinks of a ReLU network end the band before the distance that teaches best, so only
+    # its lower end, where the noise is, moves the radius.
+    low = float(radii[coherent[0]])
+    regime = "noisy" if coherent[0] > 0 and low > _NOISY_FROM else "smooth"
+    radius = max(usual, low)
+    here = float(np.interp(np.log(radius), np.log(radii), similarity))
+    return regime, radius, "central" if regime == "noisy" or here < _ROUGH else "forward"

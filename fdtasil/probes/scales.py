@@ -1,0 +1,68 @@
+"""How far each coordinate of the observations moves: what is divided by, what is probed."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fdtasil.errors import SettingError
+
+__all__ = ["Scales", "measure_scales"]
+
+# A coordinate whose deviation is below this share of the median one does not move: what is left
+# is rounding (Humanoid has one of 1.8e-14), and dividing by it would blow up the first bump.
+_STILL = 1e-4
+# The normaliser divides by no less than this share of the median deviation.
+_FLOOR = 1e-2
+_ROUNDING = 64 * float(np.finfo(np.float32).eps)
+
+
+@dataclass(frozen=True)
+class Scales:
+    """Scales of the observations.
+
+    Attributes:
+        mean: (n,) of the states.
+        scale: (n,) what the student's normaliser divides by; 1 for coordinates that do not move.
+        deviation: (n,) standard deviation of the states.
+        live: (n,) bool, whether the coordinate moves; others are not probed in whitened space.
+        seen: (n,) bool, whether the student sees the coordinate; others are never probed.
+    """
+
+    mean: np.ndarray
+    scale: np.ndarray
+    deviation: np.ndarray
+    live: np.ndarray
+    seen: np.ndarray
+
+    def probed(self, space: str | None) -> np.ndarray:
+        """Return (n,) bool, the coordinates that are probed in a space.
+
+        Raises:
+            SettingError: If there is none.
+        """
+        chosen = self.seen if space == "raw" else self.seen & self.live
+        if not chosen.any():
+            raise SettingError(
+                "the student sees no coordinate that moves",
+                "at least one",
+                "check student_obs, or pass probes=0",
+            )
+        return chosen
+
+
+def measure_scales(observations: np.ndarray, seen: np.ndarray | None = None) -> Scales:
+    """Measure the scale of each coordinate.
+
+    Args:
+        observations: (N, n) raw observations.
+        seen: (n,) bool, the coordinates that the student sees; None for all.
+    """
+    wide = observations.astype(np.float64)
+    mean, deviation = wide.mean(axis=0), wide.std(axis=0)
+    moving = deviation > _ROUNDING * np.abs(wide).max(axis=0)
+    if not moving.any():  # a single state tells nothing of scales: raw units
+        moving, deviation = np.ones_like(moving), np.ones_like(deviation)
+    median = float(np.median(deviation[moving]))
+    live = moving & (deviation > _STILL * median)
+    scale = np.where(live, np.maximum(deviation, _FLOOR * median), 1.0)
+    return Scales(mean, scale, deviation, live, np.ones_like(live) if seen is None else seen)

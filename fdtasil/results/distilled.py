@@ -1,0 +1,229 @@
+"""The result of a distillation, and its run folder."""
+
+import csv
+import io
+import json
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fdtasil.demonstrations.dataset import Dataset
+from fdtasil.demonstrations.states import Demonstrations
+from fdtasil.errors import SettingError, StorageError
+from fdtasil.experts.expert import rows_text
+from fdtasil.files.onnx.export import export_module
+from fdtasil.files.storage import to_json, verify, write_bytes, write_folder
+from fdtasil.probes.answers import Answers
+from fdtasil.probes.calibration import Calibration
+from fdtasil.results.evaluation import Evaluation
+from fdtasil.results.figures import draw_calibration, draw_returns, draw_training
+from fdtasil.student.network import Student
+from fdtasil.student.view import COLUMNS, StudentObservation, View
+
+__all__ = ["Distilled"]
+
+_PARITY_STATES = 1000
+
+
+@dataclass(frozen=True, repr=False)
+class Distilled:
+    """A student, and how it came to be.
+
+    Attributes:
+        student: The policy, on the CPU.
+        evaluation: Student against expert, from the same starts; None where there was no expert
+            or no environment to compare them in.
+        history: Training losses, one entry for each 100 steps: round, step, loss, action_error,
+            derivative_error, curvature_error, validation_loss.
+        queries: Rows that the expert answered, by purpose: act, label, probe, check (the gate),
+            evaluate.
+        settings: The exact arguments and what they resolved to, with versions; plain JSON.
+        report: What `report.json` holds.
+        dataset: The labelled states and the expert's answers around them; give it to
+            `distill(demonstrations=...)` to train another student without asking.
+
+    Example:
+        >>> import fdtasil, numpy as np
+        >>> result = fdtasil.distill(
+        ...     lambda x: np.clip(-8 * np.arctan2(x[:, 1:2], x[:, :1]) - 2 * x[:, 2:], -2, 2),
+        ...     "Pendulum-v1", probes="sphere:2,forward", episodes=1, horizon=20, steps=20,
+        ...     hidden=(8,), evaluation_episodes=2,
+        ... )
+        >>> result.queries["probe"]
+        40
+    """
+
+    student: Student
+    evaluation: Evaluation | None
+    history: list[dict[str, float]]
+    queries: dict[str, int]
+    settings: dict[str, Any]
+    report: dict[str, Any]
+    dataset: Dataset
+    view: View
+
+    def __repr__(self) -> str:
+        """Return what a notebook shows of it."""
+        lines = [
+            f"{self.report['env']}: {len(self.demonstrations):,} states, probes "
+            f"{self.report['probes']}, {self.report['steps']:,} steps",
+            f"asked of the expert: {rows_text(self.queries) or 'nothing'}",
+            "trained without an evaluation" if self.evaluation is None else str(self.evaluation),
+        ]
+        return "\n".join(lines)
+
+    @property
+    def demonstrations(self) -> Demonstrations:
+        """The labelled states."""
+        return self.dataset.demonstrations
+
+    @property
+    def answers(self) -> Answers | None:
+        """The expert's answers to the probes, or None."""
+        return self.dataset.answers
+
+    def onnx_bytes(self) -> bytes:
+        """Return the student as one ONNX file, compared with torch on its own training states.
+
+        Raises:
+            ExportError: If the two differ by more than 1e-5.
+        """
+        states = self.demonstrations.observations
+        chosen = np.linspace(0, len(states) - 1, min(len(states), _PARITY_STATES)).astype(int)
+        return export_module(self.student, self.view.look(states[chosen]), self._metadata())
+
+    def to_onnx(self, path: str | Path) -> Path:
+        """Write the student as one ONNX file: input `obs` (batch, n), output `actions`.
+
+        Normaliser and action bounds are inside; `metadata_props` says the rest.
+
+        Raises:
+            ExportError: If the file's answers differ from torch's by more than 1e-5.
+            StorageError: If it can't be written.
+        """
+        write_bytes(Path(path), self.onnx_bytes())
+        return Path(path)
+
+    def save(self, folder: str | Path) -> Path:
+        """Write the run folder.
+
+        Files: config.json, report.json, progress.csv, demonstrations.npz, student.safetensors,
+        student.onnx, figures/training.png, figures/returns.png (of an evaluation),
+        figures/calibration.png (of an expert that was probed), and last a manifest.
+
+        Raises:
+            StorageError: If a file can't be written; finished files stay whole.
+        """
+        files = {
+            "config.json": to_json(self.settings),
+            "progress.csv": _csv(self.history),
+            "demonstrations.npz": self.dataset.to_bytes(),
+            "student.safetensors": self.student.to_bytes(self._metadata()),
+            "student.onnx": self.onnx_bytes(),
+            "figures/training.png": draw_training(self.history),
+            **self._calibration_picture(),
+            "report.json": to_json(self.report),
+        }
+        if self.evaluation is not None:
+            files["figures/returns.png"] = draw_returns(self.evaluation)
+        write_folder(Path(folder), files)
+        return Path(folder)
+
+    @classmethod
+    def load(
+        cls, folder: str | Path, student_obs: StudentObservation | None = None
+    ) -> "Distilled":
+        """Read a run folder; nothing in it is run or unpickled.
+
+        Args:
+            folder: Where `save` wrote it.
+            student_obs: The function that the student sees through, which no file can hold;
+                without it a student of one can be asked, but not exported.
+
+        Raises:
+            StorageError: If a file is missing, changed since, or not one of ours.
+        """
+        files = verify(Path(folder))
+        try:
+            report = json.loads(files["report.json"])
+            settings = json.loads(files["config.json"])
+            dataset = Dataset.from_bytes(files["demonstrations.npz"])
+            evaluation = report["evaluation"]
+            return cls(
+                student=Student.from_bytes(files["student.safetensors"]),
+                evaluation=Evaluation.from_json(evaluation) if evaluation else None,
+                history=_read_csv(files["progress.csv"]),
+                queries=report["queries"],
+                settings=settings,
+                report=report,
+                dataset=dataset,
+                view=_stored_view(settings["student_obs"], student_obs, dataset),
+            )
+        except (KeyError, TypeError, ValueError) as error:
+            raise StorageError(
+                f"{folder} can't be read: {type(error).__name__} {error}",
+                "a run folder written by this version of fdtasil",
+                "check the path, or run distill again",
+            ) from error
+
+    def _calibration_picture(self) -> dict[str, bytes]:
+        found = self.report["calibration"]
+        if found is None:
+            return {}
+        return {"figures/calibration.png": draw_calibration(Calibration.from_json(found))}
+
+    def _metadata(self) -> Mapping[str, str]:
+        low, high = self.student.low.tolist(), self.student.high.tolist()
+        metadata = {
+            "fdtasil.version": self.report["versions"]["fdtasil"],
+            "fdtasil.environment": self.report["env"],
+            "fdtasil.observation_size": str(self.student.shape.observation_size),
+            "fdtasil.action_low": ",".join(f"{value:g}" for value in low),
+            "fdtasil.action_high": ",".join(f"{value:g}" for value in high),
+            "fdtasil.expert_sha256": self.report["expert"]["sha256"] or "",
+        }
+        if self.view.columns is not None:
+            metadata[COLUMNS] = ",".join(map(str, self.view.columns))
+        if self.evaluation is not None:
+            for name in ("expert_return", "student_return", "normalized_return"):
+                value = getattr(self.evaluation, name)
+                metadata[f"fdtasil.{name}"] = "" if value is None else f"{value:.6g}"
+        return metadata
+
+
+def _stored_view(
+    stored: list[int] | str | None, given: StudentObservation | None, dataset: Dataset
+) -> View:
+    states = dataset.demonstrations.observations[:256]
+    if not isinstance(stored, str):
+        return View.of(stored, states)
+    if given is not None:
+        return View.of(given, states)
+
+    def missing(rows: np.ndarray) -> np.ndarray:
+        raise SettingError(
+            f"the student sees through {stored}, which no file can hold",
+            "the function itself",
+            "pass it: Distilled.load(folder, student_obs=...)",
+        )
+
+    return View(missing, None, 0, np.ones(states.shape[1], bool))
+
+
+def _csv(history: list[dict[str, float]]) -> bytes:
+    target = io.StringIO()
+    writer = csv.DictWriter(target, list(history[0]), lineterminator="\n")
+    writer.writeheader()
+    writer.writerows(history)
+    return target.getvalue().encode()
+
+
+def _read_csv(data: bytes) -> list[dict[str, float]]:
+    integers = {"round", "step"}
+    return [
+        {name: int(value) if name in integers else float(value) for name, value in row.items()}
+        for row in csv.DictReader(io.StringIO(data.decode()))
+    ]

@@ -1,0 +1,208 @@
+"""Paired evaluation: student and expert from the same starts, with an interval."""
+
+import warnings
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from fdtasil.errors import FdtasilWarning
+from fdtasil.experts.expert import Expert
+from fdtasil.progress import Stages
+from fdtasil.rollouts.behaviours import Policy, follow, random_behaviour
+from fdtasil.rollouts.environments import EnvironmentPool
+from fdtasil.rollouts.episodes import Episodes
+from fdtasil.rollouts.rollout import rollout
+from fdtasil.seeding import generator
+
+__all__ = ["Evaluation", "compare", "interval_text", "score_text"]
+
+_RESAMPLES = 2000
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """How a student did beside its expert, from the same starts.
+
+    Attributes:
+        episodes: E, number of paired episodes.
+        horizon: T, steps after which an episode was cut.
+        expert_return: Mean undiscounted return of the expert.
+        student_return: Mean undiscounted return of the student.
+        reference_return: What counts as zero: 0 where the expert's median return is positive,
+            else the mean return of uniformly random actions.
+        normalized_return: (student - reference) / (expert - reference); 1 is the expert. None
+            where the expert is no better than the reference, and the share means nothing.
+        ci95: 95 % bootstrap interval of the normalised return, over paired episodes; None with it,
+            or for a single pair.
+        survival: Share of the student's episodes that the environment did not end.
+        expert_survival: The same for the expert.
+        action_error: Mean Euclidean distance of the student's action to the expert's, on the
+            student's own states, in action units.
+        imitation_gap: Largest distance between the two trajectories of a pair while both last,
+            in the expert's standard deviations (root mean square over coordinates), averaged over
+            pairs (TaSIL, section 2). Chaotic systems drift apart whatever the student does.
+        expert_returns: (E,) return of each episode.
+        student_returns: (E,) return of each episode, in the same order.
+        expert_physics_resets: Episodes of the expert in which the simulator put itself back.
+        physics_resets: The same for the student; where they are more than half, the returns mean
+            nothing and there is no normalised one.
+    """
+
+    episodes: int
+    horizon: int
+    expert_return: float
+    student_return: float
+    reference_return: float
+    normalized_return: float | None
+    ci95: tuple[float, float] | None
+    survival: float
+    expert_survival: float
+    action_error: float
+    imitation_gap: float
+    expert_returns: tuple[float, ...]
+    student_returns: tuple[float, ...]
+    expert_physics_resets: int = 0
+    physics_resets: int = 0
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the evaluation as plain JSON values."""
+        return {
+            name: list(value) if isinstance(value, tuple) else value
+            for name, value in vars(self).items()
+        }
+
+    @classmethod
+    def from_json(cls, fields: Mapping[str, Any]) -> "Evaluation":
+        """Read what `to_json` returned."""
+        lists = {name: tuple(value) for name, value in fields.items() if isinstance(value, list)}
+        return cls(**{**fields, **lists})
+
+    def __str__(self) -> str:
+        expert = f"{self.expert_return:10.1f}   survival {self.expert_survival:.2f}"
+        student = f"{self.student_return:10.1f}   survival {self.survival:.2f}"
+        share = f"{score_text(self.normalized_return):>10}   95 % {interval_text(self.ci95)}"
+        return (
+            f"{self.episodes} paired episodes of {self.horizon} steps\n"
+            f"  expert            {expert}\n"
+            f"  student           {student}\n"
+            f"  normalised return {share}\n"
+            f"  action error      {self.action_error:10.3f}   on the student's own states"
+        )
+
+
+def compare(
+    student: Policy,
+    expert: Expert,
+    expert_episodes: Episodes,
+    pool: EnvironmentPool,
+    horizon: int,
+    seed: int,
+    stages: Stages,
+) -> Evaluation:
+    """Run a policy from the starts of the expert's episodes, and compare.
+
+    Args:
+        student: Any policy.
+        expert: Answers on the student's states, counted under "evaluate".
+        expert_episodes: (E, T) the expert's own, already recorded.
+        pool: The environment.
+        horizon: T.
+        seed: Of the bootstrap, and of the random actions where they are the reference.
+        stages: Progress bars.
+    """
+    seeds = [int(s) for s in expert_episodes.seeds]
+    with stages.stage("evaluation", len(seeds) * horizon, "step") as move:
+        student_episodes = rollout(follow(student), pool, seeds, horizon, on_step=move)
+    reference = _reference_return(expert_episodes, pool, seeds, horizon, seed)
+    ours, theirs = student_episodes.returns, expert_episodes.returns
+    meaningful = float(theirs.mean()) > reference
+    if not meaningful:
+        least = "0" if np.median(theirs) > 0 else f"{reference:.4g}, that of random actions"
+        warnings.warn(
+            f"the expert's return {theirs.mean():.4g} is not above {least}: no normalised return; "
+            "check that expert and environment belong together",
+            FdtasilWarning,
+            stacklevel=2,
+        )
+    reset = student_episodes.physics_resets > 0
+    if reset.mean() > 0.5:  # more than one start each: not the returns of this policy
+        meaningful = False
+    visited = student_episodes.observations[student_episodes.valid]
+    own = student_episodes.actions[student_episodes.valid]
+    distance = np.linalg.norm(own - expert.ask(visited, "evaluate"), axis=1)
+    return Evaluation(
+        episodes=len(seeds),
+        horizon=horizon,
+        expert_return=float(theirs.mean()),
+        student_return=float(ours.mean()),
+        reference_return=reference,
+        normalized_return=_share(ours - reference, theirs - reference) if meaningful else None,
+        ci95=_interval(ours - reference, theirs - reference, seed) if meaningful else None,
+        survival=float(1 - student_episodes.terminated.mean()),
+        expert_survival=float(1 - expert_episodes.terminated.mean()),
+        action_error=float(distance.mean()),
+        imitation_gap=_imitation_gap(student_episodes, expert_episodes),
+        expert_returns=tuple(theirs.tolist()),
+        student_returns=tuple(ours.tolist()),
+        expert_physics_resets=int((expert_episodes.physics_resets > 0).sum()),
+        physics_resets=int(reset.sum()),
+    )
+
+
+def _reference_return(
+    expert: Episodes, pool: EnvironmentPool, seeds: list[int], horizon: int, seed: int
+) -> float:
+    if np.median(expert.returns) > 0:
+        return 0.0
+    noise = [generator(seed, "random actions", episode) for episode in range(len(seeds))]
+    return float(rollout(random_behaviour(pool), pool, seeds, horizon, noise).returns.mean())
+
+
+def score_text(share: float | None) -> str:
+    """Return a normalised return for a table."""
+    return "n/a" if share is None else f"{share:.3f}"
+
+
+def interval_text(interval: tuple[float, float] | None) -> str:
+    """Return an interval for a table."""
+    return "n/a" if interval is None else f"[{interval[0]:.3f}, {interval[1]:.3f}]"
+
+
+def _share(ours: np.ndarray, theirs: np.ndarray) -> float:
+    return float(ours.mean() / theirs.mean())
+
+
+def _interval(ours: np.ndarray, theirs: np.ndarray, seed: int) -> tuple[float, float] | None:
+    from scipy import stats  # loads for most of a second, and many runs end before it
+
+    def ratio(a: np.ndarray, b: np.ndarray, axis: int = -1) -> np.ndarray:
+        return a.mean(axis=axis) / b.mean(axis=axis)
+
+    if len(ours) < 2:
+        return None
+    if np.array_equal(ours * theirs[0], theirs * ours[0]):  # one ratio for all: nothing to draw
+        point = _share(ours, theirs)
+        return point, point
+    result = stats.bootstrap(
+        (ours, theirs),
+        ratio,
+        paired=True,
+        vectorized=True,
+        method="percentile",
+        n_resamples=_RESAMPLES,
+        rng=generator(seed, "bootstrap"),
+    )
+    return float(result.confidence_interval.low), float(result.confidence_interval.high)
+
+
+def _imitation_gap(student: Episodes, expert: Episodes) -> float:
+    both = student.valid & expert.valid
+    deviation = expert.observations[expert.valid].std(axis=0, dtype=np.float64)
+    live = deviation > 1e-6
+    if not live.any():
+        return 0.0
+    apart = (student.observations - expert.observations)[..., live] / deviation[live]
+    distance = np.sqrt((apart**2).mean(axis=-1))
+    return float(np.where(both, distance, 0.0).max(axis=1).mean())

@@ -1,0 +1,115 @@
+"""Pictures of a run; matplotlib is loaded when one is drawn."""
+
+import io
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+from fdtasil.results.evaluation import Evaluation, interval_text, score_text
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+    from fdtasil.probes.calibration import Calibration
+
+__all__ = ["draw_calibration", "draw_returns", "draw_training", "png_of"]
+
+_STUDENT, _EXPERT = "#1f77b4", "#444444"
+
+
+def draw_training(history: Sequence[dict[str, float]]) -> bytes:
+    """Draw the action error and the derivative error against the training step, as a PNG."""
+    with_probes = any(entry["derivative_error"] > 0 for entry in history)
+    figure = _figure(7.0, 3.0)
+    panels = figure.subplots(1, 2 if with_probes else 1, squeeze=False)[0]
+    steps = _cumulative_steps(history)
+    names = ("action_error", "derivative_error")
+    titles = ("error of the actions", "error of the whitened Jacobian")
+    for panel, name, title in zip(panels, names, titles, strict=False):
+        panel.plot(steps, [entry[name] for entry in history], color=_STUDENT, linewidth=1.4)
+        panel.set_yscale("log")
+        for axis_formatter in (panel.yaxis.set_major_formatter, panel.yaxis.set_minor_formatter):
+            axis_formatter("{x:.2g}")
+        panel.set_title(title, fontsize=9)
+        panel.set_xlabel("training step")
+        panel.set_ylabel("mean norm")
+        panel.grid(alpha=0.3, which="both", linewidth=0.5)
+    return png_of(figure)
+
+
+def draw_returns(evaluation: Evaluation) -> bytes:
+    """Draw each episode's return of the student against the expert's, as a PNG."""
+    from matplotlib.ticker import MaxNLocator
+
+    figure = _figure(7.0, 3.2)
+    panel = figure.subplots()
+    order = sorted(range(evaluation.episodes), key=lambda e: evaluation.expert_returns[e])
+    places = range(1, evaluation.episodes + 1)
+    for place, episode in zip(places, order, strict=True):
+        ends = evaluation.expert_returns[episode], evaluation.student_returns[episode]
+        panel.plot([place, place], ends, color="#bbbbbb", linewidth=1, zorder=1)
+    expert = [evaluation.expert_returns[e] for e in order]
+    student = [evaluation.student_returns[e] for e in order]
+    panel.scatter(places, expert, marker="s", s=22, color=_EXPERT, label="expert", zorder=2)
+    panel.scatter(places, student, marker="o", s=26, color=_STUDENT, label="student", zorder=3)
+    panel.set_title(
+        f"normalised return {score_text(evaluation.normalized_return)}, "
+        f"95 % {interval_text(evaluation.ci95)}, "
+        f"survival {evaluation.survival:.2f}",
+        fontsize=9,
+    )
+    panel.xaxis.set_major_locator(MaxNLocator(integer=True))
+    panel.set_xlabel("evaluation episode, in the order of the expert's return")
+    panel.set_ylabel(f"return over {evaluation.horizon} steps")
+    if min(*expert, *student) > 0:
+        panel.set_ylim(bottom=0)
+    panel.grid(alpha=0.3, axis="y", linewidth=0.5)
+    # Outside: between the axes its marks would read as two episodes.
+    panel.legend(frameon=False, fontsize=8, loc="upper left", bbox_to_anchor=(1, 1))
+    return png_of(figure)
+
+
+def draw_calibration(found: "Calibration") -> bytes:
+    """Draw how the expert's answers change with the distance of a probe, as a PNG."""
+    figure = _figure(7.0, 3.0)
+    change, agreement = figure.subplots(1, 2)
+    change.plot(found.radii, found.change, color=_STUDENT, marker="o", markersize=3)
+    change.axhline(found.noise_floor, color=_EXPERT, linestyle=":", label="noise floor")
+    change.set_yscale("log")
+    change.set_title("change of the action", fontsize=9)
+    change.set_ylabel("root mean square")
+    agreement.plot(found.radii[1:], found.similarity[1:], color=_STUDENT, marker="o", markersize=3)
+    agreement.set_ylim(-0.05, 1.05)
+    agreement.set_title("agreement of differences at r and r / 4", fontsize=9)
+    agreement.set_ylabel("secant similarity")
+    for panel in (change, agreement):
+        name = f"radius {found.radius:.2g}, {found.stencil} ({found.regime})"
+        panel.axvline(found.radius, color="#999999", linestyle="--", label=name)
+        panel.set_xscale("log")
+        panel.set_xlabel("radius, standard deviations", fontsize=9)
+        panel.grid(alpha=0.3, linewidth=0.5)
+    change.legend(frameon=False, fontsize=7)
+    return png_of(figure)
+
+
+def _cumulative_steps(history: Sequence[dict[str, float]]) -> list[float]:
+    """Return the steps counted on over the rounds, each of which counts from zero."""
+    steps, base, last = [], 0.0, 0.0
+    for entry in history:
+        if entry["step"] <= last:
+            base += last
+        last = entry["step"]
+        steps.append(base + last)
+    return steps
+
+
+def _figure(width: float, height: float) -> "Figure":
+    from matplotlib.figure import Figure
+
+    return Figure(figsize=(width, height), layout="constrained")
+
+
+def png_of(figure: "Figure", dpi: int = 150) -> bytes:
+    """Return a figure as a PNG that does not name the version that drew it."""
+    target = io.BytesIO()
+    figure.savefig(target, format="png", dpi=dpi, metadata={"Software": None})
+    return target.getvalue()

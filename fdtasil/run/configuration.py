@@ -1,0 +1,139 @@
+"""A run's resolved configuration: every choice made, in one frozen place."""
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+from fdtasil.demonstrations.trainers import Trainer, describe_trainer
+from fdtasil.errors import SettingError
+from fdtasil.experts.expert import rows_text
+from fdtasil.experts.gate import _ROWS_A_STATE, GATE_STATES
+from fdtasil.probes.calibration import Ladder, ladder_for
+from fdtasil.probes.source import Probes
+from fdtasil.student.fit import Fit
+
+__all__ = ["Configuration"]
+
+
+@dataclass(frozen=True)
+class Configuration:
+    """What a run does, with nothing left open.
+
+    Attributes:
+        expert: What the expert is called, or None where there is none.
+        expert_sha256: Of its file, or None.
+        env: What the environment is called.
+        trainer: Who acts in which round; None where the demonstrations are given.
+        demonstrations: sha256 of given demonstrations, or None.
+        states: Number of given states, or None.
+        probes: The derivative source, or None for plain behaviour cloning.
+        calibrated: Whether the expert is asked at many radii, for what the source leaves open.
+        usual_radius: Where such a calibration begins.
+        probes_given: Whether the answers to the probes are given with the demonstrations.
+        order: 0, 1 or 2, the order of the Taylor loss.
+        observation_size: n, of the expert.
+        student_obs: The student's coordinates, or what its function is called, or None for all.
+        hidden: Widths of the student's hidden layers.
+        activation: Of the student.
+        fit: The optimisation.
+        episodes: Number of demonstrations, recorded or given.
+        horizon: T, steps after which an episode is cut; 0 without an environment.
+        seed: The one seed.
+        device: Where the student is trained.
+        evaluation_episodes: Paired episodes of the evaluation; 0 where nothing is compared.
+        max_queries: The most that the expert may be asked, or None.
+    """
+
+    expert: str | None
+    expert_sha256: str | None
+    env: str
+    trainer: Trainer | None
+    demonstrations: str | None
+    states: int | None
+    probes: Probes | None
+    calibrated: bool
+    usual_radius: float
+    probes_given: bool
+    order: int
+    observation_size: int
+    student_obs: tuple[int, ...] | str | None
+    hidden: tuple[int, ...]
+    activation: str
+    fit: Fit
+    episodes: int
+    horizon: int
+    seed: int
+    device: str
+    evaluation_episodes: int
+    max_queries: int | None
+
+    def predicted_queries(self) -> dict[str, int]:
+        """Return the rows that the run will ask the expert for, by purpose.
+
+        Exact where no episode ends early and every coordinate moves; an upper bound elsewhere,
+        but for a source that resamples: fewer states are visited more often, each time with new
+        questions, which only `max_queries` bounds.
+        """
+        purposes = ("check", "act", "label", "calibrate", "probe", "evaluate")
+        found: dict[str, int] = dict.fromkeys(purposes, 0)
+        if self.expert is not None and self.horizon:
+            gates = 2 if self.evaluation_episodes else 1
+            found["check"] = gates * GATE_STATES * _ROWS_A_STATE
+            found["evaluate"] = 2 * self.evaluation_episodes * self.horizon
+        if self.trainer is not None:
+            found |= self.trainer.queries(self.episodes, self.horizon)
+        if self.probes is not None and not self.probes_given:
+            found["probe"] = self._predicted_probes(self.probes)
+            found["calibrate"] = self.ladder.queries if self.calibrated else 0
+        return found
+
+    @property
+    def ladder(self) -> Ladder:
+        """The radii that a calibration asks at."""
+        return ladder_for(self._predicted_probes(self.probes) if self.probes else 0)
+
+    def check_budget(self) -> None:
+        """Refuse a run that may ask more than it is allowed to.
+
+        Raises:
+            SettingError: Before anything is asked, with the parts of the prediction.
+        """
+        predicted = self.predicted_queries()
+        total = sum(predicted.values())
+        if self.max_queries is None or total <= self.max_queries:
+            return
+        raise SettingError(
+            f"this run may ask the expert {total:,} times ({rows_text(predicted)})",
+            f"at most max_queries={self.max_queries:,}",
+            "lower probes, episodes, horizon or evaluation_episodes, or raise max_queries",
+        )
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the configuration as plain JSON values."""
+        plain = {
+            name: list(value) if isinstance(value, tuple) else value
+            for name, value in vars(self).items()
+            if isinstance(value, (str, int, float, tuple, type(None)))
+        }
+        return plain | {
+            "trainer": describe_trainer(self.trainer) if self.trainer else "none",
+            "probes": self.probes.describe() if self.probes else "none",
+            "fit": asdict(self.fit),
+        }
+
+    def _predicted_probes(self, probes: Probes) -> int:
+        """Return the probe rows of all rounds.
+
+        New states are asked about once; a source that resamples asks about all states again, for
+        every pool but the first of every round.
+        """
+        counts = self.trainer.rounds(self.episodes) if self.trainer else [self.episodes]
+        length = self.horizon if self.states is None else self.states / self.episodes
+        collected, episodes, total = 0, 0, 0
+        for count in counts:
+            new = round(count * length)
+            collected, episodes = collected + new, episodes + count
+            held = round(self.fit.held_out(episodes) * length)
+            once = probes.queries(1, self.observation_size, visits=1)
+            pools = probes.pools(self.observation_size, self.fit.visits(collected - held))
+            total += once * new + once * collected * (pools - 1)
+        return total

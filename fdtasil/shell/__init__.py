@@ -1,0 +1,1 @@
+"""The commands of a shell, read from the functions of the library."""

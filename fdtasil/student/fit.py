@@ -1,0 +1,241 @@
+"""Minibatch optimisation of a student; knows no environment and no expert."""
+
+import math
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, field
+from itertools import count, islice
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from fdtasil.demonstrations.states import Demonstrations
+from fdtasil.errors import SettingError
+from fdtasil.probes.answers import Answers
+from fdtasil.probes.source import Probes
+from fdtasil.student.batches import Batches
+from fdtasil.student.fit_state import FitState
+from fdtasil.student.loss import Minibatch, Weights, taylor_loss
+from fdtasil.student.network import Student
+from fdtasil.student.step import gradient_step
+
+__all__ = ["Fit", "Hooks", "fit", "hold_out"]
+
+_LOG_EVERY = 100  # steps between two entries of the history; reading a loss waits for the device
+
+
+@dataclass(frozen=True)
+class Fit:
+    """How a student is optimised.
+
+    Attributes:
+        steps: Gradient steps, or None to count epochs.
+        steps_for: States that `steps` are meant for: more states take more steps, by the square
+            root of their number, in whole hundreds. None takes `steps` whatever their number.
+        epochs: Visits of each state, or None to count steps; one of the two is set.
+        batch_size: States in a minibatch at most; an epoch's are of almost equal size.
+        learning_rate: Peak rate of AdamW, with cosine decay to zero.
+        weight_decay: Decoupled weight decay.
+        epsilon: AdamW's epsilon.
+        weight: lambda_1, the weight of the derivative error.
+        curvature_weight: lambda_2, the weight of the error of the second differences, in a loss
+            of second order.
+        max_gradient_norm: Longer gradients are scaled to this norm; None leaves them.
+        validation: Share of the episodes held out, by which the best weights are chosen; 0 keeps
+            the last weights. A round with a single episode holds none out.
+        patience: Validations (one each 100 steps) without a better one after which training
+            stops; None goes on to the end.
+    """
+
+    steps: int | None
+    steps_for: int | None
+    epochs: int | None
+    batch_size: int
+    learning_rate: float
+    weight_decay: float
+    epsilon: float
+    weight: float
+    curvature_weight: float
+    max_gradient_norm: float | None
+    validation: float
+    patience: int | None
+
+    def __post_init__(self) -> None:
+        if (self.steps is None) == (self.epochs is None):
+            found = f"steps={self.steps}, epochs={self.epochs}"
+            raise SettingError(found, "one of the two", "leave one out")
+        if self.steps is None and self.steps_for is not None:
+            found = f"steps_for={self.steps_for} without steps"
+            raise SettingError(found, "steps that grow", "leave it out, or give steps")
+        for name in ("steps", "steps_for", "epochs", "batch_size", "patience"):
+            value = getattr(self, name)
+            whole = isinstance(value, int) and not isinstance(value, bool) and value > 0
+            if value is not None and not whole:
+                raise SettingError(f"{name}={value!r}", "a positive integer", f"write {name}=100")
+        for name in ("learning_rate", "weight_decay", "epsilon", "weight", "curvature_weight"):
+            value = getattr(self, name)
+            if not 0 <= value < math.inf:
+                raise SettingError(f"{name}={value!r}", "a number of at least 0", "raise it")
+        if self.max_gradient_norm is not None and not 0 < self.max_gradient_norm < math.inf:
+            found = f"max_gradient_norm={self.max_gradient_norm!r}"
+            raise SettingError(found, "a positive number", "write for example 1.0")
+        if not 0 <= self.validation < 1:
+            found = f"validation={self.validation!r}"
+            raise SettingError(found, "a share from 0 to below 1", "write for example 0.2")
+        if self.patience is not None and self.validation == 0:
+            raise SettingError(
+                f"patience={self.patience} without validation",
+                "held-out episodes to judge by",
+                "write for example validation=0.2",
+            )
+
+    def steps_an_epoch(self, states: int) -> int:
+        """Return the minibatches that visit each of `states` states once."""
+        return max(1, -(-states // self.batch_size))
+
+    def total_steps(self, states: int) -> int:
+        """Return the gradient steps of a training on `states` states."""
+        if self.steps is None:
+            return (self.epochs or 0) * self.steps_an_epoch(states)
+        if self.steps_for is None or states <= self.steps_for:
+            return self.steps
+        grown = self.steps * (states / self.steps_for) ** 0.5
+        return _LOG_EVERY * round(grown / _LOG_EVERY)  # a last entry of a few steps tells little
+
+    def held_out(self, episodes: int) -> int:
+        """Return how many of `episodes` episodes are held out."""
+        if self.validation == 0 or episodes < 2:
+            return 0
+        return min(max(1, round(self.validation * episodes)), episodes - 1)
+
+    def visits(self, states: int) -> int:
+        """Return how often each state is visited, the last incomplete epoch counted whole."""
+        return -(-self.total_steps(states) // self.steps_an_epoch(states))
+
+
+@dataclass(frozen=True)
+class Hooks:
+    """Who is told of a training's progress.
+
+    Attributes:
+        entry: Told each new entry of the history.
+        checkpoint: Told the state at the end of each epoch; must not keep it.
+    """
+
+    entry: Callable[[dict[str, float]], None] = field(default=lambda entry: None)
+    checkpoint: Callable[[FitState], None] = field(default=lambda state: None)
+
+
+def fit(
+    student: Student,
+    demonstrations: Demonstrations,
+    probes: Probes | None,
+    answers: Callable[[int], Answers] | None,
+    settings: Fit,
+    random: Callable[[str], torch.Generator],
+    *,
+    order: int = 1,
+    hooks: Hooks | None = None,
+    resume: bytes | None = None,
+) -> list[dict[str, float]]:
+    """Optimise a student in place.
+
+    Every epoch visits each state once, and a visit uses the next one (`probes.per_step`) of the
+    state's stored probes: the cost of a step does not grow with their number.
+
+    Args:
+        student: Changed in place.
+        demonstrations: N labelled states.
+        probes: The derivative source; None for plain behaviour cloning.
+        answers: Number of the pool -> the expert's answers; asked for pool 0, and for the next
+            one when the answers are used up, if the source resamples. None without probes.
+        settings: How.
+        random: Name of a stream -> its generator.
+        order: 1, or 2 to match second differences too.
+        hooks: Who is told of progress.
+        resume: The bytes of a state given to `hooks.checkpoint` by an earlier call with the same
+            arguments; the result is the same as without the interruption, to the byte.
+
+    Returns:
+        One entry for each 100 steps: step, loss, action_error, derivative_error,
+        curvature_error (means since the last entry), and validation_loss (the loss itself where
+        nothing is held out).
+
+    Raises:
+        FitError: If a loss or a weight is not finite; the student is of no use then.
+    """
+    told = hooks or Hooks()
+    device = student.mean.device
+    batches = Batches(demonstrations, probes, answers, random, device)
+    training, held_out = hold_out(demonstrations, settings, random("held out"))
+    per_epoch = settings.steps_an_epoch(len(training))
+    steps = settings.total_steps(len(training))
+    optimiser = torch.optim.AdamW(
+        student.parameters(),
+        lr=settings.learning_rate,
+        weight_decay=settings.weight_decay,
+        eps=settings.epsilon,
+        fused=True,
+        capturable=device.type == "cuda",
+    )
+    weights = Weights(settings.weight, settings.curvature_weight if order == 2 else None)
+    stencil = probes.stencil if probes else None
+    # Taken once, of the first pool: two validations then differ by the student alone.
+    parts = held_out.to(device).split(settings.batch_size)
+    judges = [batches.visit(part, 0) for part in parts if len(part)]
+    state = FitState(student, optimiser)
+    if resume is not None:
+        state.restore(resume)
+
+    def loss_of(batch: Minibatch) -> Tensor:
+        loss = taylor_loss(student, batch, stencil, weights)
+        return torch.stack([loss.total, loss.action, loss.derivative, loss.curvature])
+
+    step = gradient_step(student, optimiser, loss_of, settings.max_gradient_norm, device)
+    first_epoch = state.step // per_epoch
+    dealt = _deal(batches, training, per_epoch, first_epoch)
+    student.train()
+    for batch in islice(dealt, max(0, steps - state.step)):
+        if state.step % per_epoch == 0 and state.step > 0:
+            told.checkpoint(state)
+        state.count(step(batch, _cosine(settings.learning_rate, state.step, steps)))
+        if state.step % _LOG_EVERY == 0 or state.step == steps:
+            held = _held_out_loss(loss_of, judges)
+            told.entry(state.log(held))
+            if settings.patience is not None and state.stale >= settings.patience:
+                break
+    state.keep_best()
+    student.eval()
+    return state.history
+
+
+def _deal(batches: Batches, rows: Tensor, per_epoch: int, first_epoch: int) -> Iterator[Minibatch]:
+    for number in count(first_epoch):
+        yield from batches.epoch(number, rows, per_epoch)
+
+
+def _held_out_loss(
+    loss_of: Callable[[Minibatch], Tensor], judges: Sequence[Minibatch]
+) -> float | None:
+    """Return the mean loss of all held-out rows, or None where there are none."""
+    if not judges:
+        return None
+    rows = [len(batch.actions) for batch in judges]
+    losses = [float(loss_of(batch)[0].detach()) for batch in judges]
+    return sum(n * loss for n, loss in zip(rows, losses, strict=True)) / sum(rows)
+
+
+def hold_out(
+    demonstrations: Demonstrations, settings: Fit, random: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """Return the rows to train on and those of held-out episodes."""
+    everything = torch.arange(len(demonstrations))
+    episodes = np.unique(demonstrations.episode)
+    held = settings.held_out(len(episodes))
+    chosen = episodes[torch.randperm(len(episodes), generator=random)[:held].numpy()]
+    outside = torch.from_numpy(np.isin(demonstrations.episode, chosen))
+    return everything[~outside], everything[outside]
+
+
+def _cosine(peak: float, step: int, steps: int) -> float:
+    return peak * 0.5 * (1 + math.cos(math.pi * step / steps))

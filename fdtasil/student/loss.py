@@ -1,0 +1,187 @@
+"""The Taylor loss: match the expert's actions, and its differences along the probes."""
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from fdtasil.probes.stencils import Stencil
+
+__all__ = ["Minibatch", "TaylorLoss", "Weights", "taylor_loss"]
+
+
+@dataclass(frozen=True)
+class Minibatch:
+    """What one training step sees.
+
+    Attributes:
+        observations: (B, n).
+        actions: (B, m) expert actions.
+        displacements: (B, k, n) where each state is probed, or None without probes.
+        values: (B, k, p, m) what the expert said there, or None; see `Answers`.
+        gain: From `Answers`, so that the weights mean the same for every design, number of
+            probes and radius.
+    """
+
+    observations: Tensor
+    actions: Tensor
+    displacements: Tensor | None = None
+    values: Tensor | None = None
+    gain: float = 1.0
+
+
+@dataclass(frozen=True)
+class Weights:
+    """The weights of the loss's terms; that of the actions is 1.
+
+    Attributes:
+        derivative: lambda_1.
+        curvature: lambda_2, or None for a loss of first order.
+    """
+
+    derivative: float
+    curvature: float | None = None
+
+
+@dataclass(frozen=True)
+class TaylorLoss:
+    """The loss of a minibatch and its parts.
+
+    Attributes:
+        total: (), what is minimised.
+        action: (), mean norm of the action error.
+        derivative: (), mean norm of the error of the first differences, in units of the whitened
+            Jacobian's Frobenius norm; 0 without probes.
+        curvature: (), mean norm of the error of the second differences, in units of z'Hz for
+            standard normal z in whitened coordinates; 0 in a loss of first order.
+    """
+
+    total: Tensor
+    action: Tensor
+    derivative: Tensor
+    curvature: Tensor
+
+
+def taylor_loss(
+    student: nn.Module, batch: Minibatch, stencil: Stencil | None, weights: Weights
+) -> TaylorLoss:
+    """Compare a student with the expert's answers (TaSIL, equation 5, p = 0, 1, 2; appendix).
+
+    Student and expert are differenced on the same float32 points, so the loss is zero at the
+    expert whatever the radius and however rough the expert. All norms are unsquared, as in the
+    paper's experiments.
+
+    Args:
+        student: (B, n) -> (B, m).
+        batch: B states with k probes each.
+        stencil: How the expert was differenced; None without probes (p = 0).
+        weights: Of the terms.
+
+    Example:
+        >>> batch = Minibatch(torch.zeros(2, 3), torch.ones(2, 3))
+        >>> taylor_loss(nn.Identity(), batch, None, Weights(0.0)).total
+        tensor(1.7321)
+    """
+    if stencil is None or batch.displacements is None or batch.values is None:
+        action = _mean_norm(student(batch.observations) - batch.actions)
+        zero = torch.zeros_like(action)
+        return TaylorLoss(action, action, zero, zero)
+    second = weights.curvature is not None
+    errors = _exact_errors if stencil.exact else _difference_errors
+    found = errors(student, batch, batch.displacements, batch.values, stencil, second=second)
+    probes = batch.displacements.shape[1]
+    action = _mean_norm(found[0])
+    derivative = batch.gain / probes**0.5 * _mean_norm(found[1].flatten(1))
+    total, curvature = action + weights.derivative * derivative, torch.zeros_like(action)
+    if weights.curvature is not None:
+        curvature = batch.gain**2 / probes**0.5 * _mean_norm(found[2].flatten(1))
+        total = total + weights.curvature * curvature
+    return TaylorLoss(total, action, derivative, curvature)
+
+
+def _difference_errors(
+    student: nn.Module,
+    batch: Minibatch,
+    displacements: Tensor,
+    values: Tensor,
+    stencil: Stencil,
+    *,
+    second: bool,
+) -> tuple[Tensor, ...]:
+    """Return the errors (B, m) at the states, and (B, k, m) of the first (and second) ones."""
+    rows, n = batch.observations.shape
+    # Numbers, not tensors of them: a tensor would wait for the GPU at every step.
+    moved = torch.stack([offset * displacements for offset in stencil.offsets], dim=2)
+    points = batch.observations[:, None, None, :] + moved
+    # One forward pass over all points: a stencil must see one and the same function.
+    answers = student(torch.cat([batch.observations, points.reshape(-1, n)]))
+    action_error = answers[:rows] - batch.actions
+    value_errors = answers[rows:].reshape(values.shape) - values
+
+    # The difference of errors is the error of the difference: both are linear.
+    def difference(weights: tuple[float, ...], centre: float) -> Tensor:
+        total = centre * action_error[:, None, :]
+        for weight, errors in zip(weights, value_errors.unbind(dim=2), strict=True):
+            total = total + weight * errors
+        return total
+
+    first = difference(stencil.weights, stencil.centre)
+    if not second or stencil.second is None:
+        return action_error, first
+    *around, centre = stencil.second
+    return action_error, first, difference(tuple(around), centre)
+
+
+def _exact_errors(
+    student: nn.Module,
+    batch: Minibatch,
+    displacements: Tensor,
+    values: Tensor,
+    stencil: Stencil,
+    *,
+    second: bool,
+) -> tuple[Tensor, ...]:
+    """Return the errors (B, m) at the states, and (B, k, m) of the exact derivatives."""
+    count = displacements.shape[1]
+    states = batch.observations.repeat_interleave(count, dim=0)
+    along = _second_derivative_along if second else _derivative_along
+    answers, *derivatives = along(student, states, displacements.flatten(0, 1))
+    action_error = answers[::count] - batch.actions
+    errors = [
+        derivative.reshape(values[:, :, 0].shape) - values[:, :, order]
+        for order, derivative in enumerate(derivatives)
+    ]
+    return action_error, *errors
+
+
+def _derivative_along(
+    student: nn.Module, states: Tensor, directions: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return f(x) and J u, each (B, m), differentiable.
+
+    Reverse mode twice: v'J is linear in v, and its derivative there is J. Forward mode takes half
+    as long again, for its formulas of the activations are decomposed into many small operations.
+    """
+    states = states.detach().requires_grad_()
+    answers = student(states)
+    dummy = torch.zeros_like(answers, requires_grad=True)
+    (pulled,) = torch.autograd.grad(answers, states, dummy, create_graph=True)
+    (slopes,) = torch.autograd.grad(pulled, dummy, directions, create_graph=True)
+    return answers, slopes
+
+
+def _second_derivative_along(
+    student: nn.Module, states: Tensor, directions: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return f(x), J u and u'H u, each (B, m), differentiable."""
+
+    def both(x: Tensor) -> tuple[Tensor, Tensor]:
+        answers, slopes, *_ = torch.func.jvp(student, (x,), (directions,))
+        return answers, slopes
+
+    (answers, slopes), (_, curvatures), *_ = torch.func.jvp(both, (states,), (directions,))
+    return answers, slopes, curvatures
+
+
+def _mean_norm(errors: Tensor) -> Tensor:
+    return torch.linalg.vector_norm(errors, dim=-1).mean()

@@ -1,0 +1,168 @@
+"""What the student sees of what the expert sees."""
+
+import operator
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from fdtasil.demonstrations.states import Demonstrations
+from fdtasil.errors import ExpertError, SettingError, shown
+from fdtasil.experts.hub import fetch
+from fdtasil.experts.hub.place import is_hub_uri
+from fdtasil.files.onnx.model import read_model
+from fdtasil.probes.answers import Answers
+from fdtasil.rollouts.behaviours import Policy
+
+__all__ = ["COLUMNS", "StudentObservation", "View", "columns_of", "describe_view"]
+
+StudentObservation = Sequence[int] | Callable[[np.ndarray], np.ndarray]
+"""Indices of the coordinates that the student sees, or (B, n) -> (B, k)."""
+
+COLUMNS = "fdtasil.observation_columns"
+"""Metadata entry of an exported student that sees some coordinates only."""
+
+_SAME = 1e-4  # relative; beyond the rounding of float32, below any nonlinearity worth the name
+
+
+@dataclass(frozen=True)
+class View:
+    """The student's part of an observation.
+
+    Attributes:
+        look: (B, n) -> (B, k).
+        columns: The indices, where the view is a choice of coordinates; else None.
+        size: k.
+        seen: (n,) bool, the coordinates that the view depends on; only these are probed.
+    """
+
+    look: Callable[[np.ndarray], np.ndarray]
+    columns: tuple[int, ...] | None
+    size: int
+    seen: np.ndarray
+
+    @staticmethod
+    def of(student_obs: StudentObservation | None, states: np.ndarray) -> "View":
+        """Read the argument `student_obs`.
+
+        Args:
+            student_obs: Indices or a function; None for the whole observation.
+            states: (B, n) states, around which the function's dependence is measured.
+
+        Raises:
+            SettingError: If indices are outside the observation, or the function does not map
+                (B, n) to (B, k) row by row.
+        """
+        n = states.shape[1]
+        if student_obs is None:
+            return View(lambda rows: rows, None, n, np.ones(n, bool))
+        if callable(student_obs):
+            return _from_function(student_obs, states)
+        columns = _indices(student_obs)
+        if not columns or not all(0 <= index < n for index in columns):
+            raise _not_indices(student_obs, f"indices from 0 to {n - 1}, at least one")
+        seen = np.isin(np.arange(n), columns)
+        return View(lambda rows: rows[:, list(columns)], columns, len(columns), seen)
+
+    def policy(self, student: Policy) -> Policy:
+        """Return the student as a policy on whole observations."""
+        return lambda observations: student(self.look(observations))
+
+    def demonstrations(self, whole: Demonstrations) -> Demonstrations:
+        """Return the demonstrations as the student sees them."""
+        seen = np.ascontiguousarray(self.look(whole.observations), np.float32)
+        return replace(whole, observations=seen)
+
+    def answers(self, whole: Answers, states: np.ndarray, offsets: Sequence[float]) -> Answers:
+        """Return the probes as the student sees them.
+
+        Args:
+            whole: The expert's answers.
+            states: (N, n) the states that they belong to.
+            offsets: Of the stencil, which a curved view does not keep.
+
+        Raises:
+            SettingError: If the view is curved and the stencil has points on both sides.
+        """
+        if self.columns is not None:
+            bank = np.ascontiguousarray(whole.displacements[:, list(self.columns)])
+            return Answers(bank, whole.numbers, whole.values, whole.gain)
+        if self.size == states.shape[1] and np.array_equal(self.look(states), states):
+            return whole
+        centres, moved = self.look(states), whole.displacements[whole.numbers]
+        # Exact derivatives have no offsets: a view that is linear keeps them too.
+        sides = offsets or (1.0, -1.0)
+        steps = [self._step(states, centres, offset * moved) / offset for offset in sides]
+        if not all(np.allclose(steps[0], step, rtol=0.01, atol=_SAME) for step in steps[1:]):
+            raise SettingError(
+                "student_obs is a curved function, and the derivatives are exact or central",
+                "a linear function, indices, or the forward stencil",
+                'write for example probes="sphere:10,forward"',
+            )
+        bank = steps[0].reshape(-1, self.size).astype(np.float32)
+        numbers = np.arange(len(bank), dtype=np.int32).reshape(whole.numbers.shape)
+        return Answers(bank, numbers, whole.values, whole.gain)
+
+    def _step(self, states: np.ndarray, centres: np.ndarray, moved: np.ndarray) -> np.ndarray:
+        points = states[:, None, :] + moved
+        seen = self.look(points.reshape(-1, points.shape[-1]))
+        return seen.reshape(*points.shape[:2], -1) - centres[:, None, :]
+
+
+def columns_of(policy: object) -> tuple[int, ...] | None:
+    """Return the columns that an exported student's file says it sees, or None."""
+    path = fetch(policy).path if is_hub_uri(policy) else policy
+    if not isinstance(path, (str, Path)) or Path(path).suffix != ".onnx":
+        return None
+    model, _ = read_model(Path(path))
+    texts = {entry.key: entry.value for entry in model.metadata_props}
+    columns = texts.get(COLUMNS)
+    try:
+        return None if columns is None else tuple(int(column) for column in columns.split(","))
+    except (TypeError, ValueError) as error:
+        raise ExpertError(
+            f"{path} says that it sees the columns {shown(columns)}",
+            "numbers with commas between, as fdtasil writes them",
+            "export the student again, or pass student_obs=",
+        ) from error
+
+
+def describe_view(student_obs: StudentObservation | None) -> tuple[int, ...] | str | None:
+    """Return a view as it is written into a configuration."""
+    if student_obs is None:
+        return None
+    if callable(student_obs):
+        return f"the function {getattr(student_obs, '__name__', type(student_obs).__name__)}"
+    return _indices(student_obs)
+
+
+def _indices(student_obs: Sequence[int]) -> tuple[int, ...]:
+    try:
+        mask = np.asarray(student_obs)
+        chosen = np.flatnonzero(mask) if mask.dtype == bool else student_obs
+        return tuple(operator.index(index) for index in chosen)
+    except TypeError:
+        raise _not_indices(student_obs, "integers, a boolean mask, or a function") from None
+
+
+def _not_indices(student_obs: object, expected: str) -> SettingError:
+    example = "write for example student_obs=range(10)"
+    return SettingError(f"student_obs={student_obs!r}", expected, example)
+
+
+def _from_function(function: Callable[[np.ndarray], np.ndarray], states: np.ndarray) -> View:
+    n, found = states.shape[1], np.asarray(function(states))
+    alone = np.asarray(function(states[:1]))
+    if found.ndim != 2 or len(found) != len(states) or not np.allclose(alone[0], found[0]):
+        raise SettingError(
+            f"student_obs maps {states.shape} to {found.shape}",
+            "a function (B, n) -> (B, k) of each row on its own",
+            "index or transform the last axis only",
+        )
+    spread = np.maximum(states.std(axis=0), 1e-3)
+    seen = [
+        not np.array_equal(np.asarray(function(states + spread * (np.arange(n) == i))), found)
+        for i in range(n)
+    ]
+    return View(function, None, found.shape[1], np.array(seen))
