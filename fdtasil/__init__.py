@@ -1,24 +1,44 @@
 """Distil a black-box controller into a small torch policy that reacts as it does.
 
-import fdtasil
+    import fdtasil
 
-result = fdtasil.distill("experts/HalfCheetah-v5.onnx", "HalfCheetah-v5", probes=10)
-print(result.evaluation)
-result.to_onnx("student.onnx")
+    result = fdtasil.distill("experts/HalfCheetah-v5.onnx", "HalfCheetah-v5", probes=10)
+    print(result.evaluation)
+    result.to_onnx("student.onnx")
+
+The rooms, on the way of the data; a room imports only those above it and the ground:
+
+    rollouts        who acts in an environment, and what is recorded
+    experts         who is asked
+    probes          where else the expert is asked
+    demonstrations  what is learnt from
+    student         who learns, and how
+    results         what came of it
+    run             the loop
+    shell           the commands
+
+On the ground: files, checks, seeding, compute, progress, errors. `fdtasil.testing` has checks for
+experts and students of one's own.
 """
 
-from fdtasil.demonstrations.dataset import Dataset
-from fdtasil.demonstrations.minari_data import from_minari, to_minari
-from fdtasil.demonstrations.trainers import DAgger, Dart
-from fdtasil.errors import FdtasilError, FdtasilWarning
-from fdtasil.experts.expert import Expert
-from fdtasil.experts.load import load_expert
-from fdtasil.probes.source import Probes
-from fdtasil.results.distilled import Distilled
-from fdtasil.results.evaluation import Evaluation
-from fdtasil.run.events import Event
-from fdtasil.run.pipeline import distill, evaluate
-from fdtasil.student.network import Student
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from fdtasil.demonstrations.dataset import Dataset
+    from fdtasil.demonstrations.minari_data import from_minari, to_minari
+    from fdtasil.demonstrations.trainers import DAgger, Dart
+    from fdtasil.errors import FdtasilError, FdtasilWarning
+    from fdtasil.experts.expert import Expert
+    from fdtasil.experts.load import load_expert
+    from fdtasil.probes.source import Probes
+    from fdtasil.results.distilled import Distilled
+    from fdtasil.results.evaluation import Evaluation
+    from fdtasil.run.events import Event, Log
+    from fdtasil.run.pipeline import distill, evaluate
+    from fdtasil.student.architectures import Mlp
+    from fdtasil.student.fit import Fit
+    from fdtasil.student.policy import Student
 
 __version__ = "0.1.0"
 
@@ -32,6 +52,9 @@ __all__ = [
     "Expert",
     "FdtasilError",
     "FdtasilWarning",
+    "Fit",
+    "Log",
+    "Mlp",
     "Probes",
     "Student",
     "__version__",
@@ -41,3 +64,34 @@ __all__ = [
     "load_expert",
     "to_minari",
 ]
+
+# Loaded when they are first named: torch alone takes seconds, and `fdtasil --help` needs none.
+_ROOMS = {
+    "demonstrations.dataset": ("Dataset",),
+    "demonstrations.minari_data": ("from_minari", "to_minari"),
+    "demonstrations.trainers": ("DAgger", "Dart"),
+    "errors": ("FdtasilError", "FdtasilWarning"),
+    "experts.expert": ("Expert",),
+    "experts.load": ("load_expert",),
+    "probes.source": ("Probes",),
+    "results.distilled": ("Distilled",),
+    "results.evaluation": ("Evaluation",),
+    "run.events": ("Event", "Log"),
+    "run.pipeline": ("distill", "evaluate"),
+    "student.architectures": ("Mlp",),
+    "student.fit": ("Fit",),
+    "student.policy": ("Student",),
+}
+_HOME = {name: room for room, names in _ROOMS.items() for name in names}
+
+
+def __getattr__(name: str) -> object:
+    if name not in _HOME:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    found = getattr(import_module(f"{__name__}.{_HOME[name]}"), name)
+    globals()[name] = found
+    return found
+
+
+def __dir__() -> list[str]:
+    return sorted({*globals(), *__all__})

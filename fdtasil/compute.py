@@ -4,16 +4,25 @@ import re
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+import numpy as np
 import torch
 
 from fdtasil.errors import FitError, SettingError
 
-__all__ = ["pick_device", "torch_settings"]
+__all__ = ["ask_module", "pick_device", "torch_settings"]
 
 # "medium" sends float32 products through oneDNN, twice as fast on AMD CPUs as the default and
 # as exact there; a chip with bfloat16 matrix units may round for real, which this bound catches.
 _ACCEPTED_ERROR = 2e-6
 _FULL = re.compile("CUDA.*out of memory|CUBLAS_STATUS_ALLOC_FAILED")
+
+
+def ask_module(module: torch.nn.Module, observations: np.ndarray) -> np.ndarray:
+    """Answer (B, n) observations with (B, m) float32, on the module's device and in its type."""
+    like = next(module.parameters(), torch.zeros(()))
+    with torch.no_grad():
+        batch = torch.from_numpy(np.ascontiguousarray(observations, np.float32))
+        return module(batch.to(like.device, like.dtype)).float().cpu().numpy()
 
 
 def pick_device(device: str) -> torch.device:

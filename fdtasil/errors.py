@@ -1,4 +1,10 @@
-"""The library's errors: what was found, what was expected, and the next step."""
+"""The library's errors and warnings: what was found, what was expected, and the next step."""
+
+import contextlib
+import os
+import sys
+import warnings
+from pathlib import Path
 
 __all__ = [
     "EnvironmentFault",
@@ -11,7 +17,11 @@ __all__ = [
     "StorageError",
     "first_line",
     "shown",
+    "warn",
 ]
+
+# Frames that are no caller's: the library's own, and those of its context managers.
+_OURS = (str(Path(__file__).parent) + os.sep, contextlib.__file__)
 
 
 class FdtasilError(Exception):
@@ -67,6 +77,14 @@ class StorageError(FdtasilError, OSError):
 
 class FdtasilWarning(UserWarning):
     """Something that did not stop the work, and that the result should be read with."""
+
+
+def warn(message: str) -> None:
+    """Warn with the line of the caller's own code that led here, however deep that is."""
+    frame, level = sys._getframe(1), 2
+    while frame.f_back is not None and frame.f_code.co_filename.startswith(_OURS):
+        frame, level = frame.f_back, level + 1
+    warnings.warn(message, FdtasilWarning, stacklevel=level)
 
 
 def first_line(error: Exception) -> str:

@@ -1,15 +1,35 @@
 """Progress bars with the time left; silent where there is no terminal."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 
 from tqdm import tqdm
 
-__all__ = ["Stages"]
+__all__ = ["Bar", "Progress"]
 
 
-class Stages:
-    """The stages of a run, one bar each.
+class Bar:
+    """A bar that is shown, or not."""
+
+    def __init__(self, bar: tqdm) -> None:
+        self._bar = bar
+
+    def move(self, count: int) -> None:
+        """Move on by `count`."""
+        self._bar.update(count)
+
+    def reach(self, count: int) -> None:
+        """Move on to `count` in all."""
+        self._bar.update(count - self._bar.n)
+
+    def lengthen(self, total: int) -> None:
+        """Say how long it is, where that was not known before."""
+        self._bar.total = total
+        self._bar.refresh()
+
+
+class Progress:
+    """The bars of a run, one for each thing that takes long.
 
     Args:
         shown: Whether to show bars at all.
@@ -20,13 +40,9 @@ class Stages:
         self._disable = None if shown else True
 
     @contextmanager
-    def stage(self, title: str, total: int, unit: str) -> Iterator[Callable[[int], None]]:
-        """Show a bar while the block runs; yields the function that moves it on."""
+    def bar(self, title: str, unit: str, total: int | None = None) -> Iterator[Bar]:
+        """Show a bar while the block runs."""
         with tqdm(
             total=total, desc=f"{title:24}", unit=unit, disable=self._disable, leave=False
         ) as bar:
-
-            def move(count: int) -> None:
-                bar.update(count)
-
-            yield move
+            yield Bar(bar)

@@ -5,22 +5,9 @@ import hashlib
 import numpy as np
 import torch
 
-from fdtasil.errors import SettingError
+from fdtasil.checks import check_count
 
-__all__ = ["check_seed", "episode_seeds", "generator", "torch_generator"]
-
-
-def check_seed(seed: int) -> int:
-    """Return `seed` as a plain int.
-
-    Raises:
-        SettingError: If it is not an integer from 0 to 2**32 - 1.
-    """
-    if isinstance(seed, bool) or not isinstance(seed, (int, np.integer)) or not 0 <= seed < 2**32:
-        raise SettingError(
-            f"seed={seed!r}", "an integer from 0 to 4294967295", "write for example seed=0"
-        )
-    return int(seed)
+__all__ = ["episode_seeds", "generator", "torch_generator"]
 
 
 def generator(seed: int, *path: str | int) -> np.random.Generator:
@@ -58,4 +45,6 @@ def episode_seeds(seed: int, stream: str, first: int, count: int) -> list[int]:
 def _sequence(seed: int, path: tuple[str | int, ...]) -> np.random.SeedSequence:
     name = "/".join(str(part) for part in path).encode()
     words = np.frombuffer(hashlib.sha256(name).digest()[:16], dtype=np.uint32)
-    return np.random.SeedSequence([check_seed(seed), *(int(word) for word in words)])
+    return np.random.SeedSequence(
+        [check_count("seed", seed, 0, 2**32 - 1), *(int(word) for word in words)]
+    )

@@ -1,28 +1,21 @@
 """Checks that anyone can run on an expert or a student of their own: one named result each."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-
 import numpy as np
 
 from fdtasil.errors import ExpertError, ExportError
+from fdtasil.experts.examination import LOOKED_AT, look_closely
 from fdtasil.experts.expert import Expert
-from fdtasil.experts.gate import Finding, examine_expert
-from fdtasil.experts.load import ExpertLike, load_expert
-from fdtasil.experts.sb3.trust import Trust
+from fdtasil.experts.gate import Finding
+from fdtasil.experts.load import ExpertLike
 from fdtasil.files.onnx.export import export_module
-from fdtasil.rollouts.behaviours import follow, random_behaviour
-from fdtasil.rollouts.environments import Boxes, EnvironmentLike, EnvironmentPool, resolve_horizon
+from fdtasil.rollouts.environments import Boxes, EnvironmentLike, EnvironmentPool
 from fdtasil.rollouts.episodes import Episodes
-from fdtasil.rollouts.rollout import rollout
-from fdtasil.seeding import episode_seeds, generator
-from fdtasil.student.network import Student
+from fdtasil.student.policy import Student
 
-__all__ = ["check_expert", "check_student"]
+__all__ = ["Finding", "check_expert", "check_student"]
 
-_STATES, _EPISODES = 32, 3
+_EPISODES = 3
 _FAR = 1e3
-_SAME = 1e-4
 
 
 def check_expert(
@@ -31,8 +24,6 @@ def check_expert(
     *,
     horizon: int | None = None,
     seed: int = 0,
-    output: str | None = None,
-    trust: Trust = None,
 ) -> list[Finding]:
     """Check that an expert can be distilled, on states of its environment.
 
@@ -41,8 +32,6 @@ def check_expert(
         env: As in `fdtasil.distill`.
         horizon: Steps after which an episode is cut; default: the environment's time limit.
         seed: Of three episodes of the expert, and three of random actions.
-        output: Name of the ONNX output with the actions, where several could be it.
-        trust: As in `fdtasil.distill`.
 
     Returns:
         One finding for each check: opening, answers, determinism, batch independence, action
@@ -60,13 +49,10 @@ def check_expert(
         []
     """
     with EnvironmentPool(env) as pool:
-        looked = _look(expert, pool, horizon, seed, output, trust)
-        if looked.own is None or looked.expert is None:
-            return looked.findings
-        noise = [generator(seed, "random actions", episode) for episode in range(_EPISODES)]
-        starts, length = looked.own.seeds.tolist(), looked.own.valid.shape[1]
-        chance = rollout(random_behaviour(pool), pool, starts, length, noise)
-        return [*looked.findings, _better_than(looked.own, chance, looked.expert.name)]
+        looked = look_closely(expert, pool, horizon, seed, _EPISODES)
+    if looked.own is None or looked.chance is None or looked.expert is None:
+        return looked.findings
+    return [*looked.findings, _better_than(looked.own, looked.chance, looked.expert.name)]
 
 
 def check_student(
@@ -96,69 +82,12 @@ def check_student(
         ['far states']
     """
     with EnvironmentPool(env) as pool:
-        looked = _look(student, pool, horizon, seed)
+        looked = look_closely(student, pool, horizon, seed, _EPISODES)
         if looked.own is None or looked.expert is None:
             return looked.findings
-        states = looked.own.spread(_STATES)
+        states = looked.own.spread(LOOKED_AT)
         findings = [*looked.findings, _far(looked.expert, states, pool.boxes)]
     return [*findings, _export(student, states)] if isinstance(student, Student) else findings
-
-
-@dataclass(frozen=True)
-class _Looked:
-    """What the checks of experts and students share: it was opened, followed and examined."""
-
-    findings: list[Finding]
-    expert: Expert | None = None
-    own: Episodes | None = None
-
-
-def _look(
-    policy: ExpertLike,
-    pool: EnvironmentPool,
-    horizon: int | None,
-    seed: int,
-    output: str | None = None,
-    trust: Trust = None,
-) -> _Looked:
-    boxes, length = pool.boxes, resolve_horizon(horizon, pool)
-    sizes = boxes.observation_size, boxes.action_size
-    try:
-        opened = load_expert(policy, *sizes, output=output, trust=trust)
-    except ExpertError as error:
-        return _Looked([Finding("opening", error.found, error)])
-    opening = Finding("opening", f"{opened.name}: {sizes[0]} -> {sizes[1]} numbers", None)
-    try:
-        starts = episode_seeds(seed, "evaluation", 0, _EPISODES)
-        own = rollout(follow(opened.policy("act")), pool, starts, length)
-    except ExpertError as error:
-        return _Looked([opening, Finding("answers", error.found, error)])
-    states = own.spread(_STATES)
-    examined = [*examine_expert(opened, states, boxes), _batch_sizes(opened, states)]
-    return _Looked([opening, *examined], opened, own)
-
-
-def _batch_sizes(expert: Expert, states: np.ndarray) -> Finding:
-    """Look at the batches that reveal a function of single rows: as many rows as coordinates."""
-    name, width = "batch sizes", states.shape[1]
-    rows = np.tile(states, (width // len(states) + 2, 1))[: width + 2]
-    counts = (1, 2, width, width + 1)
-    try:
-        whole = expert.ask(rows, "check")
-        parts = {count: expert.ask(rows[:count], "check") for count in counts}
-    except ExpertError as error:
-        return Finding(name, error.found, error)
-    bound = _SAME * max(1.0, float(np.abs(whole).max()))
-    wrong = [n for n, part in parts.items() if np.abs(part - whole[:n]).max() > bound]
-    if not wrong:
-        return Finding(name, f"the same answers in batches of {_listed(counts)} rows", None)
-    found = f"{expert.name} answers otherwise in batches of {_listed(wrong)} rows"
-    advice = "return one row of actions for each row of observations"
-    return Finding(name, found, ExpertError(found, "answers row by row", advice))
-
-
-def _listed(numbers: Sequence[int]) -> str:
-    return ", ".join(map(str, numbers))
 
 
 def _far(expert: Expert, states: np.ndarray, boxes: Boxes) -> Finding:

@@ -1,21 +1,28 @@
 """What an expert goes through before it teaches."""
 
-import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
-from fdtasil.errors import FdtasilWarning
+from fdtasil.errors import ExpertError, warn
 from fdtasil.experts.expert import Expert
-from fdtasil.experts.gate import GATE_STATES, check_expert
-from fdtasil.progress import Stages
-from fdtasil.rollouts.behaviours import follow
-from fdtasil.rollouts.environments import EnvironmentPool
+from fdtasil.experts.gate import GATE_STATES, Finding, admit_expert, examine_expert
+from fdtasil.experts.load import ExpertLike, load_expert
+from fdtasil.progress import Progress
+from fdtasil.rollouts.behaviours import follow, random_behaviour
+from fdtasil.rollouts.environments import EnvironmentPool, resolve_horizon
 from fdtasil.rollouts.episodes import Episodes, check_episodes
 from fdtasil.rollouts.rollout import first_observations, rollout
+from fdtasil.seeding import episode_seeds, generator
 
-__all__ = ["check_first", "examine"]
+__all__ = ["LOOKED_AT", "Looked", "check_first", "examine", "look_closely"]
 
-_LONG = 600.0  # seconds of questions that are announced
+LOOKED_AT = 32
+"""States that a closer look is taken at."""
+_SAME = 1e-4  # of two answers, relative to the largest action
+
+_LONG = 600.0  # seconds of queries that are announced
 
 
 def examine(
@@ -23,21 +30,21 @@ def examine(
     pool: EnvironmentPool,
     starts: list[int],
     horizon: int,
-    stages: Stages,
+    progress: Progress,
     *,
     force: bool,
     rows: int = 0,
 ) -> Episodes:
     """Check an expert on first states, let it act, and check it on the states that it visited.
 
-    Before it acts it is known how fast it is, and so how long its questions may take.
+    Before it acts it is known how fast it is, and so how long its queries may take.
 
     Args:
         expert: Counts what it is asked under "check" and "evaluate".
         pool: The environment.
         starts: Seeds of the episodes.
         horizon: T, steps after which an episode is cut.
-        stages: Progress bars.
+        progress: Progress bars.
         force: Go on with a warning where it fails a check but answers.
         rows: That the whole run may ask for; a long wait for them is announced.
 
@@ -49,11 +56,11 @@ def examine(
         EnvironmentFault: If nothing can be learnt from its episodes.
     """
     check_first(expert, pool, starts, force=force, rows=rows)
-    with stages.stage("expert", len(starts) * horizon, "step") as move:
+    with progress.bar("expert", "step", len(starts) * horizon) as bar:
         behaviour = follow(expert.policy("evaluate"))
-        episodes = rollout(behaviour, pool, starts, horizon, on_step=move)
+        episodes = rollout(behaviour, pool, starts, horizon, on_step=bar.move)
     check_episodes(episodes, pool.name)
-    check_expert(expert, episodes.spread(GATE_STATES), pool.boxes, force=force)
+    admit_expert(expert, episodes.spread(GATE_STATES), pool.boxes, force=force)
     return episodes
 
 
@@ -67,23 +74,94 @@ def check_first(
     """
     first = first_observations(pool, [starts[e % len(starts)] for e in range(GATE_STATES)])
     if not np.array_equal(first_observations(pool, starts[:1])[0], first[0]):
-        warnings.warn(
+        warn(
             f"{pool.name} does not start from the same observation twice with one seed, so equal "
             "runs differ, and expert and student are not compared from the same starts: seed it "
-            "in reset(), and take off wrappers with a memory (NormalizeObservation)",
-            FdtasilWarning,
-            stacklevel=5,
+            "in reset(), and take off wrappers with a memory (NormalizeObservation)"
         )
-    _announce(check_expert(expert, first, pool.boxes, force=force), rows)
+    _announce(admit_expert(expert, first, pool.boxes, force=force), rows)
 
 
 def _announce(seconds: float, rows: int) -> None:
-    """Warn of questions that take long, before they are asked."""
+    """Warn of queries that take long, before they are asked."""
     if seconds * rows > _LONG:
-        warnings.warn(
+        warn(
             f"the expert takes {1000 * seconds:.3g} ms a row, so the {rows:,} rows that this run "
             f"may ask take up to {seconds * rows / 3600:.1f} h: lower probes, episodes, horizon "
-            "or evaluation_episodes, or let load_expert(..., workers=) answer side by side",
-            FdtasilWarning,
-            stacklevel=6,
+            "or evaluation_episodes, or let load_expert(..., workers=) answer side by side"
         )
+
+
+@dataclass(frozen=True)
+class Looked:
+    """What a closer look at a policy found.
+
+    Attributes:
+        findings: One for each check; opening and answers only, where it can't answer.
+        expert: The policy, or None where it can't be opened.
+        own: Its episodes, or None where it can't answer.
+        chance: Episodes of random actions from the same starts, or None.
+    """
+
+    findings: list[Finding]
+    expert: Expert | None = None
+    own: Episodes | None = None
+    chance: Episodes | None = None
+
+
+def look_closely(
+    source: ExpertLike, pool: EnvironmentPool, horizon: int | None, seed: int, episodes: int
+) -> Looked:
+    """Open a policy, let it and chance act, and check it on states that it visited.
+
+    Args:
+        source: As in `load_expert`.
+        pool: The environment.
+        horizon: T, or None for the environment's own.
+        seed: Of the episodes.
+        episodes: How many.
+
+    Raises:
+        EnvironmentFault: If the environment can't be used.
+        SettingError: If an argument can't be used.
+    """
+    boxes, length = pool.boxes, resolve_horizon(horizon, pool)
+    sizes = boxes.observation_size, boxes.action_size
+    try:
+        expert = load_expert(source, *sizes)
+    except ExpertError as error:
+        return Looked([Finding("opening", error.found, error)])
+    opening = Finding("opening", f"{expert.name}: {sizes[0]} -> {sizes[1]} numbers", None)
+    starts = episode_seeds(seed, "evaluation", 0, episodes)
+    try:
+        own = rollout(follow(expert.policy("act")), pool, starts, length)
+    except ExpertError as error:
+        return Looked([opening, Finding("answers", error.found, error)], expert)
+    noise = [generator(seed, "random actions", episode) for episode in range(episodes)]
+    chance = rollout(random_behaviour(pool), pool, starts, length, noise)
+    states = own.spread(LOOKED_AT)
+    examined = [*examine_expert(expert, states, boxes), _batch_sizes(expert, states)]
+    return Looked([opening, *examined], expert, own, chance)
+
+
+def _batch_sizes(expert: Expert, states: np.ndarray) -> Finding:
+    """Look at the batches that reveal a function of single rows: as many rows as coordinates."""
+    name, width = "batch sizes", states.shape[1]
+    rows = np.tile(states, (width // len(states) + 2, 1))[: width + 2]
+    counts = (1, 2, width, width + 1)
+    try:
+        whole = expert.ask(rows, "check")
+        parts = {count: expert.ask(rows[:count], "check") for count in counts}
+    except ExpertError as error:
+        return Finding(name, error.found, error)
+    bound = _SAME * max(1.0, float(np.abs(whole).max()))
+    wrong = [n for n, part in parts.items() if np.abs(part - whole[:n]).max() > bound]
+    if not wrong:
+        return Finding(name, f"the same answers in batches of {_listed(counts)} rows", None)
+    found = f"{expert.name} answers otherwise in batches of {_listed(wrong)} rows"
+    advice = "return one row of actions for each row of observations"
+    return Finding(name, found, ExpertError(found, "answers row by row", advice))
+
+
+def _listed(numbers: Sequence[int]) -> str:
+    return ", ".join(map(str, numbers))

@@ -9,17 +9,35 @@ import numpy as np
 import torch
 
 from fdtasil.errors import ExpertError, SettingError, shown
+from fdtasil.experts.sb3.trust import Trust
 from fdtasil.experts.worker_process import as_array
+from fdtasil.rollouts.behaviours import Policy
 
-__all__ = ["Answer", "Expert", "Purpose", "RaisedElsewhere"]
+__all__ = ["Expert", "Hints", "Purpose", "RaisedElsewhere"]
 
 Purpose = Literal["check", "act", "label", "calibrate", "probe", "evaluate"]
 """Why a row was asked: gate, acting in rollouts, labels, radius, probes, evaluation."""
 
-Answer = Callable[[np.ndarray], np.ndarray]
-"""(B, n) float32 raw observations -> (B, m) actions in environment units."""
-
 CHUNK = 1024  # rows asked at once; a fixed size keeps onnxruntime's memory from growing
+
+
+@dataclass(frozen=True)
+class Hints:
+    """What a caller knows of an expert before it is opened.
+
+    Attributes:
+        observation_size: n, or None.
+        action_size: m, or None; chooses among the outputs of an ONNX file.
+        output: Name of the ONNX output that holds the actions, or None.
+        trust: "pickle" where code inside a file may be run.
+        timeout: Seconds that a batch may take, or None.
+    """
+
+    observation_size: int | None = None
+    action_size: int | None = None
+    output: str | None = None
+    trust: Trust = None
+    timeout: float | None = None
 
 
 class RaisedElsewhere(Exception):
@@ -39,7 +57,7 @@ class Workers(Protocol):
     """Several that answer at once."""
 
     def each(
-        self, ask: Callable[[np.ndarray, Answer], np.ndarray], batches: Sequence[np.ndarray]
+        self, ask: Callable[[np.ndarray, Policy], np.ndarray], batches: Sequence[np.ndarray]
     ) -> list[np.ndarray]:
         """Return `ask(batch, answer)` of every batch, in their order, whoever answers it."""
         ...
@@ -51,10 +69,12 @@ class Expert:
 
     Attributes:
         answer: (B, n) float32 raw observations -> (B, m) actions in environment units.
-        name: What to call it in messages and reports.
+        name: What to call it in messages.
         observation_size: n, or None where the expert does not say.
         action_size: m, or None where the expert does not say.
         sha256: Of the file it came from, or None.
+        source: What to call it in reports, its path or address; None where it has none.
+        columns: The coordinates that a student's file says it sees, or None.
         module: The same function as a differentiable torch module, or None; only the analytic
             reference (`probes="jacobian"`) uses it.
         chunk: Rows asked at once.
@@ -68,18 +88,20 @@ class Expert:
         (array([2., 2., 2.], dtype=float32), {'probe': 3})
     """
 
-    answer: Answer
+    answer: Policy
     name: str
     observation_size: int | None = None
     action_size: int | None = None
     sha256: str | None = None
+    source: str | None = None
+    columns: tuple[int, ...] | None = None
     module: torch.nn.Module | None = None
     chunk: int = CHUNK
     workers: Workers | None = None
     queries: Counter[str] = field(default_factory=Counter)
 
     def ask(self, observations: np.ndarray, purpose: Purpose) -> np.ndarray:
-        """Answer a batch and count its rows.
+        """Policy a batch and count its rows.
 
         Args:
             observations: (B, n) finite raw observations, in any type that numpy takes for
@@ -125,7 +147,7 @@ class Expert:
             ) from error
         return rows
 
-    def _ask_chunk(self, rows: np.ndarray, ask: Answer) -> np.ndarray:
+    def _ask_chunk(self, rows: np.ndarray, ask: Policy) -> np.ndarray:
         expected = f"({len(rows)}, {self.action_size or 'm'}) finite numbers"
         try:
             # Each call gets a copy and its answer is copied: experts that write into their input

@@ -1,17 +1,21 @@
 """The gate: what an expert must show on real states before anything is spent on it."""
 
 import time
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from fdtasil.errors import ExpertError, FdtasilError, FdtasilWarning
+from fdtasil.errors import ExpertError, FdtasilError, warn
 from fdtasil.experts.expert import Expert
 from fdtasil.rollouts.environments import Boxes
 
-__all__ = ["Finding", "check_expert", "examine_expert"]
+__all__ = ["GATE_QUERIES", "GATE_STATES", "Finding", "admit_expert", "examine_expert"]
+
+GATE_STATES = 16
+"""States that the gate asks about, before and after the expert's first rollouts."""
+GATE_QUERIES = 3 * GATE_STATES
+"""What it asks each time: every state in a batch, once more, and alone."""
 
 # Differences between two answers, as a share of the action range. Batches of another size change
 # the last bits of a float32 product; quantised and stochastic experts change the third digit.
@@ -63,7 +67,7 @@ def _examine(
         times.append(time.perf_counter())
     except ExpertError as error:
         return [Finding("answers", error.found, error)], 0.0
-    probe = _Probe(expert, observations, answers, boxes)
+    probe = _Answers(expert, observations, answers, boxes)
     found = Finding("answers", f"{answers.shape[1]} finite numbers for each observation", None)
     findings = [
         found,
@@ -72,11 +76,11 @@ def _examine(
         probe.within_bounds(),
         probe.fills_bounds(),
     ]
-    # The first question may start workers, and any may meet a busy machine: the quickest counts.
+    # The first query may start workers, and any may meet a busy machine: the quickest counts.
     return findings, float(np.diff(times).min()) / len(observations)
 
 
-def check_expert(
+def admit_expert(
     expert: Expert, observations: np.ndarray, boxes: Boxes, *, force: bool = False
 ) -> float:
     """Check an expert on real states, and raise what is wrong with it.
@@ -105,7 +109,7 @@ def raise_problems(findings: Sequence[Finding], *, force: bool) -> None:
             continue
         if not force or finding.name == "answers":
             raise finding.problem
-        warnings.warn(f"{finding.problem.found} (forced)", FdtasilWarning, stacklevel=3)
+        warn(f"{finding.problem.found} (forced)")
 
 
 _STOCHASTIC = (
@@ -119,7 +123,7 @@ _BATCH_DEPENDENT = (
 
 
 @dataclass(frozen=True)
-class _Probe:
+class _Answers:
     """The answers that the checks share."""
 
     expert: Expert
@@ -161,11 +165,9 @@ class _Probe:
         wider = float(min(-self.boxes.low.max(), self.boxes.high.min()))
         measured = f"largest action {largest:.3g}, bounds {_numbers(self.boxes.high)}"
         if 1.5 <= wider < np.inf and largest <= 1.0 + 1e-6 and saturated > 0.1:
-            warnings.warn(
+            warn(
                 f"all actions of {self.expert.name} lie in [-1, 1], the bounds are +-{wider:.3g}: "
-                "is the action scale missing from the export?",
-                FdtasilWarning,
-                stacklevel=5,
+                "is the action scale missing from the export?"
             )
         return Finding("action scale", measured, None)
 
@@ -178,9 +180,3 @@ class _Probe:
 def _numbers(values: np.ndarray) -> str:
     """Return one number where all are equal, else the list."""
     return f"{values[0]:g}" if np.all(values == values[0]) else str(values)
-
-
-GATE_STATES = 16  # states that the gate asks about, before and after the expert's first rollouts
-
-
-_ROWS_A_STATE = 3  # asked, asked again, asked alone

@@ -1,4 +1,4 @@
-"""The kinds of experts, one function each, and the choice between them."""
+"""Whatever answers observations with actions: a table of kinds, and the choice between them."""
 
 import copy
 import dataclasses
@@ -6,6 +6,7 @@ import inspect
 import warnings
 from collections import Counter
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any, Protocol, runtime_checkable
@@ -13,17 +14,19 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 import torch
 
+from fdtasil.checks import check_count
+from fdtasil.compute import ask_module
 from fdtasil.errors import ExpertError, FdtasilWarning, SettingError
-from fdtasil.experts.expert import CHUNK, Answer, Expert
+from fdtasil.experts.expert import CHUNK, Expert, Hints
 from fdtasil.experts.http_expert import is_http_url, open_http
-from fdtasil.experts.hub import fetch
-from fdtasil.experts.hub.place import is_hub_uri
+from fdtasil.experts.hub import fetch, is_hub_uri
 from fdtasil.experts.onnx_expert import open_onnx
 from fdtasil.experts.sb3.agent import read_agent
 from fdtasil.experts.sb3.trust import Trust
 from fdtasil.experts.workers import BATCH, check_workers, with_processes, with_threads
+from fdtasil.rollouts.behaviours import Policy
 
-__all__ = ["ExpertLike", "load_expert"]
+__all__ = ["KINDS", "ExpertLike", "Kind", "load_expert", "open_expert", "sized"]
 
 
 @runtime_checkable
@@ -67,7 +70,7 @@ def load_expert(
         trust: "pickle" lets stable-baselines3 load what can't be read from a zip without running
             code that is in it.
         workers: Processes that answer side by side, for slow experts. They start at the first
-            question, hold a copy of the expert each, and compute on one thread.
+            query, hold a copy of the expert each, and compute on one thread.
         threads: Use threads of this process instead, for experts that wait or let other threads
             run; those behind HTTP always do.
         timeout: Seconds that a batch may take; a process that hangs is ended. None is for ever,
@@ -85,73 +88,26 @@ def load_expert(
         >>> load_expert(lambda observations: -observations[:, :2], action_size=2).name
         'the function <lambda>'
     """
-    remote = is_http_url(source)
-    check_workers(workers, threads, timeout, remote)
-    if isinstance(source, Expert):
-        expert = dataclasses.replace(source, queries=Counter())
-    elif is_http_url(source):
-        expert = open_http(source, action_size, timeout)
-    elif is_hub_uri(source):
-        expert = _from_hub(str(source), observation_size, action_size, output, trust)
-    elif isinstance(source, (str, Path)) and Path(source).suffix == ".zip":
-        expert = _from_agent(Path(source), trust)
-    elif isinstance(source, (str, Path)):
-        expert = open_onnx(Path(source), observation_size, action_size, output)
-    elif isinstance(source, torch.nn.Module) and _is_the_policy(source, observation_size):
-        expert = _from_module(source)
-    elif isinstance(source, Predictor):
-        expert = _from_predict(source)
-    elif callable(source):
-        expert = Expert(source, f"the function {_name(source)}")
-    else:
-        raise ExpertError(
-            f"expert is a {type(source).__name__}",
-            "an ONNX path, a torch module, an object with predict, or a function on batches",
-            "wrap it: lambda observations: ...  ((B, n) -> (B, m))",
-        )
-    expert = _sized(expert, observation_size, action_size)
+    kind, hints = _kind_of(source), Hints(observation_size, action_size, output, trust, timeout)
+    check_workers(workers, threads, timeout, kind.remote)
+    expert = sized(kind.opens(source, hints), observation_size, action_size)
     if batch is None and workers and expert.chunk == CHUNK:
         batch = BATCH
-    expert = expert if batch is None else _limited(expert, batch)
+    if batch is not None:
+        expert = dataclasses.replace(expert, chunk=check_count("batch", batch))
     if not workers:
         return expert
-    if threads or remote:  # who waits for a server needs no process
+    if threads or kind.remote:  # who waits for a server needs no process
         return with_threads(expert, workers)
-    return with_processes(expert, _opener(source, expert, output, trust), workers, timeout)
+    return with_processes(expert, _opener(source, expert, hints), workers, timeout)
 
 
-def _opener(
-    source: ExpertLike, expert: Expert, output: str | None, trust: Trust
-) -> Callable[[], Answer] | None:
-    """Return what opens a file again in another process; what is no file is sent as it is."""
-    if not isinstance(source, (str, Path)):
-        return None
-    place = expert.name if is_hub_uri(source) else Path(source).absolute()
-    sizes = expert.observation_size, expert.action_size
-    return partial(_open_again, place, *sizes, output, trust, expert.sha256)
+def open_expert(source: ExpertLike, hints: Hints) -> Expert:
+    """Open an expert whose sizes may be others than those hinted at; see `load_expert`."""
+    return _kind_of(source).opens(source, hints)
 
 
-def _open_again(
-    place: str | Path,
-    observation_size: int | None,
-    action_size: int | None,
-    output: str | None,
-    trust: Trust,
-    sha256: str | None,
-) -> Answer:
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", FdtasilWarning)  # the caller has been told
-        expert = load_expert(place, observation_size, action_size, output=output, trust=trust)
-    if expert.sha256 != sha256:
-        raise ExpertError(
-            f"{place} has changed since it was opened",
-            f"sha256 {sha256}",
-            "leave the file as it is while it is asked, or open it again",
-        )
-    return expert.answer
-
-
-def _sized(expert: Expert, observation_size: int | None, action_size: int | None) -> Expert:
+def sized(expert: Expert, observation_size: int | None, action_size: int | None) -> Expert:
     """Return the expert with its sizes, where they are not others than those expected."""
     said = (expert.observation_size, expert.action_size)
     expected = (observation_size, action_size)
@@ -167,39 +123,82 @@ def _sized(expert: Expert, observation_size: int | None, action_size: int | None
     )
 
 
-def _from_hub(
-    uri: str,
-    observation_size: int | None,
-    action_size: int | None,
-    output: str | None,
-    trust: Trust,
-) -> Expert:
-    if trust is not None:
+def _kind_of(source: object) -> "Kind":
+    for kind in KINDS:
+        if kind.recognises(source):
+            return kind
+    raise ExpertError(
+        f"expert is a {type(source).__name__}",
+        "an ONNX path, a torch module, an object with predict, or a function on batches",
+        "wrap it: lambda observations: ...  ((B, n) -> (B, m))",
+    )
+
+
+def _opener(source: ExpertLike, expert: Expert, hints: Hints) -> Callable[[], Policy] | None:
+    """Return what opens a file again in another process; what is no file is sent as it is."""
+    if not isinstance(source, (str, Path)):
+        return None
+    # The hub's files are called by their commit, which the source may leave open.
+    file = expert.name if is_hub_uri(source) else Path(source).absolute()
+    known = dataclasses.replace(
+        hints, observation_size=expert.observation_size, action_size=expert.action_size
+    )
+    return partial(_open_again, file, known, expert.sha256)
+
+
+def _open_again(file: str | Path, hints: Hints, sha256: str | None) -> Policy:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FdtasilWarning)  # the caller has been told
+        expert = open_expert(file, hints)
+    if expert.sha256 != sha256:
+        raise ExpertError(
+            f"{file} has changed since it was opened",
+            f"sha256 {sha256}",
+            "leave the file as it is while it is asked, or open it again",
+        )
+    return expert.answer
+
+
+def _from_expert(expert: Expert, hints: Hints) -> Expert:
+    return dataclasses.replace(expert, queries=Counter())
+
+
+def _from_http(url: str, hints: Hints) -> Expert:
+    return open_http(url, hints.action_size, hints.timeout)
+
+
+def _from_hub(uri: str | Path, hints: Hints) -> Expert:
+    if hints.trust is not None:
         raise SettingError(
-            f"trust={trust!r} with {uri}",
+            f"trust={hints.trust!r} with {uri}",
             "no trust: what others put on the hub is never run",
             "download the file, look at it, and name its path",
         )
     file = fetch(uri)
-    expert = load_expert(file.path, observation_size, action_size, output=output)
-    return dataclasses.replace(expert, name=file.uri)
+    return dataclasses.replace(open_expert(file.path, hints), name=file.uri, source=file.uri)
 
 
-def _from_agent(path: Path, trust: Trust) -> Expert:
-    agent = read_agent(path, trust=trust)
+def _from_agent(path: str | Path, hints: Hints) -> Expert:
+    agent = read_agent(path, trust=hints.trust)
     return dataclasses.replace(
         _from_module(agent.module),
-        name=path.name,
+        name=Path(path).name,
         observation_size=agent.observation_size,
         action_size=len(agent.action_low),
         sha256=agent.sha256,
+        source=str(path),
     )
+
+
+def _from_torch(module: torch.nn.Module, hints: Hints) -> Expert:
+    """Ask a module by calling it, unless it has a `predict` that answers otherwise."""
+    if not isinstance(module, Predictor) or _is_the_policy(module, hints.observation_size):
+        return _from_module(module)
+    return _from_predict(module)
 
 
 def _is_the_policy(module: torch.nn.Module, observation_size: int | None) -> bool:
     """Whether calling a module is asking it: stable-baselines3's policies scale in `predict`."""
-    if not isinstance(module, Predictor):
-        return True
     if observation_size is None:
         return False
     rows = np.random.default_rng(0).standard_normal((8, observation_size)).astype(np.float32)
@@ -212,17 +211,11 @@ def _is_the_policy(module: torch.nn.Module, observation_size: int | None) -> boo
 
 def _from_module(given: torch.nn.Module) -> Expert:
     module = copy.deepcopy(given).eval()  # the caller's may go on training
-    place = next((p for p in module.parameters()), torch.zeros(()))
-
-    def answer(observations: np.ndarray) -> np.ndarray:
-        with torch.no_grad():
-            batch = torch.from_numpy(observations).to(place.device, place.dtype)
-            return module(batch).float().cpu().numpy()
-
+    answer = partial(ask_module, module)
     return Expert(answer, f"the torch module {type(module).__name__}", module=module)
 
 
-def _from_predict(source: Predictor) -> Expert:
+def _from_predict(source: Any, hints: Hints | None = None) -> Expert:
     name = f"{type(source).__name__}.predict"
     # scikit-learn's predict takes the batch alone; stable-baselines3's is stochastic by default.
     parameters = inspect.signature(source.predict).parameters
@@ -244,11 +237,42 @@ def _from_predict(source: Predictor) -> Expert:
     return Expert(answer, name)
 
 
-def _limited(expert: Expert, batch: int) -> Expert:
-    if isinstance(batch, bool) or batch < 1:
-        raise ExpertError(f"batch={batch!r}", "a positive number of rows", "write batch=1")
-    return dataclasses.replace(expert, chunk=batch)
+def _from_function(function: Callable[[np.ndarray], np.ndarray], hints: Hints) -> Expert:
+    name = getattr(function, "__name__", type(function).__name__)
+    return Expert(function, f"the function {name}")
 
 
-def _name(function: Callable[..., Any]) -> str:
-    return getattr(function, "__name__", type(function).__name__)
+def _is_path(source: object) -> bool:
+    return isinstance(source, (str, Path))
+
+
+def _is_zip(source: object) -> bool:
+    return isinstance(source, (str, Path)) and Path(source).suffix == ".zip"
+
+
+@dataclass(frozen=True)
+class Kind:
+    """One kind of expert.
+
+    Attributes:
+        recognises: Whether a source is of this kind.
+        opens: A source of this kind, and what is known of it -> the expert.
+        remote: Whether somebody else answers, is waited for, and keeps the time.
+    """
+
+    recognises: Callable[[object], bool]
+    opens: Callable[[Any, Hints], Expert]
+    remote: bool = False
+
+
+KINDS = (
+    Kind(lambda source: isinstance(source, Expert), _from_expert),
+    Kind(is_http_url, _from_http, remote=True),
+    Kind(is_hub_uri, _from_hub),
+    Kind(_is_zip, _from_agent),
+    Kind(_is_path, open_onnx),
+    Kind(lambda source: isinstance(source, torch.nn.Module), _from_torch),
+    Kind(lambda source: isinstance(source, Predictor), _from_predict),
+    Kind(callable, _from_function),
+)
+"""Every kind of expert; the first that recognises a source opens it."""

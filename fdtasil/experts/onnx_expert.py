@@ -1,18 +1,17 @@
 """ONNX files as experts, with the names, types and batch sizes that users' files have."""
 
 import time
-import warnings
-from collections.abc import Callable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fdtasil.errors import ExpertError, FdtasilWarning, first_line, shown
-from fdtasil.experts.expert import Expert
+from fdtasil.errors import ExpertError, first_line, shown, warn
+from fdtasil.experts.expert import Expert, Hints
 from fdtasil.experts.twin import torch_twin
 from fdtasil.files.onnx.model import read_model
 from fdtasil.files.onnx.session import is_batched, open_session, rebatched, run_session
+from fdtasil.rollouts.behaviours import Policy
 
 if TYPE_CHECKING:
     import onnx
@@ -20,23 +19,20 @@ if TYPE_CHECKING:
 
     Session = onnxruntime.InferenceSession
 
-__all__ = ["open_onnx"]
+__all__ = ["COLUMNS", "open_onnx"]
 
-Answer = Callable[[np.ndarray], np.ndarray]
+COLUMNS = "fdtasil.observation_columns"
+"""Metadata entry of an exported student that sees some coordinates only."""
 
 _FLOATS = ("tensor(float)", "tensor(double)", "tensor(float16)")
 
 
-def open_onnx(
-    path: Path, observation_size: int | None, action_size: int | None, output: str | None
-) -> Expert:
+def open_onnx(source: str | Path, hints: Hints) -> Expert:
     """Open an ONNX file as an expert.
 
     Args:
-        path: The file; weights may lie in a side file beside it.
-        observation_size: n, or None to believe the file.
-        action_size: m, or None to believe the file.
-        output: Name of the output that holds the actions, where several could.
+        source: The file; weights may lie in a side file beside it.
+        hints: Sizes, where the file leaves them open, and the output that holds the actions.
 
     Returns:
         The expert. Its `module` is a torch twin where the graph is an MLP, else None.
@@ -44,11 +40,12 @@ def open_onnx(
     Raises:
         ExpertError: If the file can't be opened, or its signature does not fit.
     """
+    path = Path(source)
     model, digest = read_model(path)
-    session = open_session(model, str(path))
+    session, columns = open_session(model, str(path)), _columns(model, path)
     try:
-        n = _observation_size(session, path, observation_size)
-        chosen = _choose_output(session, path, action_size, output)
+        n = _observation_size(session, path, None if columns else hints.observation_size)
+        chosen = _choose_output(session, path, hints.action_size, hints.output)
         answer = _answer(model, session, chosen, n)
         m = answer(np.zeros((2, n), np.float32)).shape[-1]
         twin = torch_twin(model, chosen, answer, n)
@@ -63,7 +60,21 @@ def open_onnx(
             if limited
             else "export it again, and ask it with onnxruntime alone",
         ) from error
-    return Expert(answer, path.name, n, m, digest, twin)
+    return Expert(answer, path.name, n, m, digest, str(source), columns, twin)
+
+
+def _columns(model: "onnx.ModelProto", path: Path) -> tuple[int, ...] | None:
+    """Return the columns that an exported student's file says it sees, or None."""
+    texts = {entry.key: entry.value for entry in model.metadata_props}
+    columns = texts.get(COLUMNS)
+    try:
+        return None if columns is None else tuple(int(column) for column in columns.split(","))
+    except (TypeError, ValueError) as error:
+        raise ExpertError(
+            f"{path} says that it sees the columns {shown(columns)}",
+            "numbers with commas between, as fdtasil writes them",
+            "export the student again, or remove that entry of its metadata",
+        ) from error
 
 
 def _observation_size(session: "Session", path: Path, wanted: int | None) -> int:
@@ -115,7 +126,7 @@ def _choose_output(
         raise ExpertError(
             f"{path} has {len(fitting)} outputs that could be the actions: {described}",
             f"one floating-point output (batch, {action_size or 'm'})",
-            'name it: output="..." (--output on the command line)'
+            'name it: load_expert(path, output="...") (--output on the command line)'
             if fitting
             else "check that expert and environment belong together",
         )
@@ -131,7 +142,7 @@ def _could_be_actions(entry: "onnxruntime.NodeArg", rank: int, action_size: int 
     return len(entry.shape) == rank and action_size in (None, entry.shape[-1])
 
 
-def _answer(model: "onnx.ModelProto", session: "Session", output: str, n: int) -> Answer:
+def _answer(model: "onnx.ModelProto", session: "Session", output: str, n: int) -> Policy:
     """Return the fastest way to ask that gives the answers of single rows."""
     if len(session.get_inputs()[0].shape) == 1:
         return _slow(lambda rows: _one_by_one(session, output, rows), 1, n)
@@ -179,7 +190,7 @@ def _takes_batches(session: "Session", output: str, n: int) -> bool:
     return answers.ndim != 2 or len(answers) == 3
 
 
-def _agree(at_once: Answer, in_turn: Answer, n: int) -> bool:
+def _agree(at_once: Policy, in_turn: Policy, n: int) -> bool:
     rows = np.random.default_rng(0).standard_normal((17, n)).astype(np.float32)
     try:
         fast, slow = at_once(rows), in_turn(rows)
@@ -190,18 +201,16 @@ def _agree(at_once: Answer, in_turn: Answer, n: int) -> bool:
     return fast.shape == slow.shape and np.allclose(fast, slow, rtol=1e-4, atol=1e-5)
 
 
-def _slow(in_turn: Answer, size: int, n: int) -> Answer:
+def _slow(in_turn: Policy, size: int, n: int) -> Policy:
     rows = np.zeros((64 * size, n), np.float32)
     in_turn(rows[:size])
     start = time.perf_counter()
     in_turn(rows)
     seconds = (time.perf_counter() - start) / len(rows)
-    warnings.warn(
+    warn(
         f"the model takes {size} row(s) at a time and can't be re-batched: asked in turn, "
         f"{1e6 * seconds:.0f} microseconds a row (batches are about ten times faster); "
-        "export it with a free batch dimension to mend this",
-        FdtasilWarning,
-        stacklevel=4,
+        "export it with a free batch dimension to mend this"
     )
     return in_turn
 

@@ -1,17 +1,19 @@
 """Directions that look at the states: isotropic, or half of them where the states lie apart."""
 
 from dataclasses import dataclass
+from typing import ClassVar
 
 import numpy as np
 
-from fdtasil.probes.directions import RandomSphere, check_directions
+from fdtasil.checks import check_count
+from fdtasil.probes.directions import USUAL_COUNT, RandomSphere, count_of
 
 __all__ = ["AdaptiveDirections", "is_redundant"]
 
 _VARIANCE = 0.99
 _STATES = 2048  # looked at for excursions: enough for a bank, and 2048 x 2048 distances are quick
 _APART = 10  # rows: a state's neighbours in time are not where a student would drift to
-_SHORT = 0.01  # of an isotropic direction's length: asks the same question again
+_SHORT = 0.01  # of an isotropic direction's length: asks the same query again
 _STRETCH = 2.0
 _MIXED = 3
 
@@ -28,10 +30,21 @@ class AdaptiveDirections:
     return 0.81 with isotropic directions, 0.92 with the mixture.
     """
 
-    probes: int
+    probes: int = USUAL_COUNT
+    name: ClassVar[str] = "adaptive"
+    exact: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
-        check_directions(self.probes)
+        object.__setattr__(self, "probes", check_count("probes", self.probes))
+
+    @classmethod
+    def parse(cls, count: str | None) -> "AdaptiveDirections":
+        """See `Directions.parse`."""
+        return cls(count_of(count))
+
+    def describe(self) -> str:
+        """See `Directions.describe`."""
+        return f"{self.name}:{self.probes}"
 
     def count(self, dimension: int) -> int:
         """As many as asked for."""

@@ -1,18 +1,17 @@
 """The expert's answers around demonstrated states: asked in bounded blocks, kept in one array."""
 
-import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from fdtasil.errors import ExpertError, FdtasilWarning, SettingError
+from fdtasil.errors import ExpertError, SettingError, warn
 from fdtasil.experts.expert import Expert, Purpose
 from fdtasil.probes.derivatives import differentiate
 from fdtasil.probes.scales import Scales
 from fdtasil.probes.source import Probes
 
-__all__ = ["UNFOLLOWED", "Answers", "Asking", "ask_moved", "ask_probes"]
+__all__ = ["FROM_THE_START", "Answers", "Beginning", "ask_moved", "ask_probes"]
 
 # States that a design is shown: enough to tell which displacements can occur.
 _SHOWN = 4096
@@ -60,11 +59,11 @@ class Answers:
 
 
 @dataclass(frozen=True)
-class Asking:
-    """How an asking that takes long is followed, and goes on.
+class Beginning:
+    """What is there already of answers that take long to ask, and who hears of the others.
 
     Attributes:
-        known: (S, k, p, m) what an interrupted asking had of the first S states, or None.
+        known: (S, k, p, m) answers around the first S states, or None.
         told: Given the (S, k, p, m) answers so far and how many states of them are new.
     """
 
@@ -72,7 +71,7 @@ class Asking:
     told: Callable[[np.ndarray, int], None] = lambda values, states: None
 
 
-UNFOLLOWED = Asking()
+FROM_THE_START = Beginning()
 
 
 def ask_probes(
@@ -82,7 +81,7 @@ def ask_probes(
     scales: Scales,
     random: np.random.Generator,
     order: int = 1,
-    asking: Asking = UNFOLLOWED,
+    beginning: Beginning = FROM_THE_START,
 ) -> Answers:
     """Ask the expert around each state.
 
@@ -93,7 +92,7 @@ def ask_probes(
         scales: Of the demonstrations.
         random: Draws the directions.
         order: 1, or 2 for exact second derivatives too; a finite stencil has them in its values.
-        asking: Who follows it; nobody does where derivatives are exact.
+        beginning: What is there already; not used where derivatives are exact.
 
     Raises:
         ExpertError: If the stencil is exact and the expert can't be differentiated.
@@ -101,7 +100,7 @@ def ask_probes(
             the answers do not fit into memory.
     """
     try:
-        return _ask_probes(expert, observations, probes, scales, random, order, asking)
+        return _ask_probes(expert, observations, probes, scales, random, order, beginning)
     except MemoryError as error:
         raise SettingError(
             f"{probes.describe()!r} at {len(observations):,} states does not fit into memory",
@@ -134,7 +133,7 @@ def _ask_probes(
     scales: Scales,
     random: np.random.Generator,
     order: int,
-    asking: Asking,
+    beginning: Beginning,
 ) -> Answers:
     deviation = 1.0 if probes.space == "raw" else scales.deviation
     step_scale = np.where(scales.probed(probes.space), deviation, 0.0)
@@ -155,7 +154,7 @@ def _ask_probes(
         values = differentiate(expert, observations, displacements, numbers, order)
     else:
         offsets = probes.stencil.offsets
-        values = _ask_values(expert, observations, displacements, numbers, offsets, asking)
+        values = _ask_values(expert, observations, displacements, numbers, offsets, beginning)
     return Answers(displacements, numbers, values, gain)
 
 
@@ -165,18 +164,18 @@ def _ask_values(
     displacements: np.ndarray,
     numbers: np.ndarray,
     offsets: Sequence[float],
-    asking: Asking,
+    beginning: Beginning,
 ) -> np.ndarray:
     """Ask for the values at the stencil's points, a bounded number of rows at a time."""
     states, count = numbers.shape
     block = max(1, _ROWS // (count * len(offsets)))
     shifts = np.asarray(offsets, np.float32)[:, None]
     values, done = None, 0
-    if asking.known is not None:
-        done = len(asking.known)
-        values = np.empty((states, *asking.known.shape[1:]), np.float32)
-        values[:done] = asking.known
-        asking.told(values[:done], done)
+    if beginning.known is not None:
+        done = len(beginning.known)
+        values = np.empty((states, *beginning.known.shape[1:]), np.float32)
+        values[:done] = beginning.known
+        beginning.told(values[:done], done)
     for start in range(done, states, block):
         rows = slice(start, start + block)
         moved = displacements[numbers[rows]][:, :, None, :] * shifts
@@ -187,7 +186,7 @@ def _ask_values(
             values = np.empty((states, count, len(offsets), answers.shape[1]), np.float32)
             _announce(values)
         values[rows] = answers.reshape(*points.shape[:3], -1)
-        asking.told(values[: start + len(points)], len(points))
+        beginning.told(values[: start + len(points)], len(points))
     assert values is not None, "there is no demonstration without a state"
     return values
 
@@ -195,11 +194,9 @@ def _ask_values(
 def _announce(values: np.ndarray) -> None:
     """Say what the answers take where that is much; the memory is not touched yet."""
     if values.nbytes > _MUCH:
-        warnings.warn(
+        warn(
             f"the expert's answers, {values.shape[0]:,} states x {values.shape[1]} probes, take "
-            f"{values.nbytes / 2**30:.1f} GiB of memory; fewer probes take less and teach alike",
-            FdtasilWarning,
-            stacklevel=4,
+            f"{values.nbytes / 2**30:.1f} GiB of memory; fewer probes take less and teach alike"
         )
 
 
@@ -221,12 +218,10 @@ def _check_steps(displacements: np.ndarray, observations: np.ndarray, probes: Pr
     shares = np.where(sizes > 0, errors / np.where(sizes > 0, sizes, 1), 0)
     worst = int(shares.argmax())
     if shares[worst] > _ROUNDED:
-        warnings.warn(
+        warn(
             f"float32 rounds away {min(1.0, shares[worst]):.0%} of the step along coordinate "
             f"{worst}, of {sizes[worst]:.2g} beside values of {values[worst]:.2g}: raise the "
-            "radius, or probe in whitened space",
-            FdtasilWarning,
-            stacklevel=4,
+            "radius, or probe in whitened space"
         )
 
 

@@ -1,13 +1,12 @@
 """How far to probe: what an expert's answers look like at many distances, asked once."""
 
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 
-from fdtasil.errors import FdtasilWarning
+from fdtasil.errors import warn
 from fdtasil.experts.expert import Expert
 from fdtasil.probes.answers import ask_moved
 from fdtasil.probes.scales import Scales
@@ -123,11 +122,9 @@ class Calibration:
         elif radius > _FAR:
             reason = "no demonstrated state lies that far from the others"
         if reason is not None:
-            warnings.warn(
+            warn(
                 f"radius={radius:g}: {reason}; the calibration suggests {self.radius:.2g} "
-                f"(agreement {best:.2f}), which leaving radius= out takes",
-                FdtasilWarning,
-                stacklevel=2,
+                f"(agreement {best:.2f}), which leaving radius= out takes"
             )
 
 

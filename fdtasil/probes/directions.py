@@ -1,13 +1,24 @@
 """Where to probe: every design lowers to a bank of directions and row numbers per state."""
 
 from dataclasses import dataclass
-from typing import Protocol
+from typing import ClassVar, Protocol
 
 import numpy as np
 
-from fdtasil.errors import SettingError
+from fdtasil.checks import check_count
 
-__all__ = ["Directions", "OrthogonalFrames", "RandomSphere", "StandardBasis", "check_directions"]
+__all__ = [
+    "USUAL_COUNT",
+    "Directions",
+    "Jacobian",
+    "OrthogonalFrames",
+    "RandomSphere",
+    "StandardBasis",
+    "count_of",
+]
+
+USUAL_COUNT = 10
+"""Probes of a state, where nobody says another number."""
 
 # Rows of a bank: with more states than this, states share directions, which costs no accuracy
 # (the states differ) and keeps Humanoid's 100,000 states from storing gigabytes of directions.
@@ -15,7 +26,28 @@ _BANK = 4096
 
 
 class Directions(Protocol):
-    """Where to probe, in the coordinates that are live."""
+    """Where to probe, in the coordinates that are live.
+
+    Attributes:
+        name: What a derivative source calls the design.
+        exact: Whether the expert is differentiated along the directions, and not asked.
+    """
+
+    name: ClassVar[str]
+    exact: ClassVar[bool]
+
+    @classmethod
+    def parse(cls, count: str | None) -> "Directions":
+        """Return the design, with the text after its colon, if there is one.
+
+        Raises:
+            ValueError: If it can't be so many.
+        """
+        ...
+
+    def describe(self) -> str:
+        """Return the text that names design and count, which `Probes.parse` reads back."""
+        ...
 
     def count(self, dimension: int) -> int:
         """Return how many directions each state is probed along."""
@@ -45,6 +77,19 @@ class Directions(Protocol):
 class StandardBasis:
     """One direction along each coordinate; all of them together are the whole Jacobian."""
 
+    name: ClassVar[str] = "basis"
+    exact: ClassVar[bool] = False
+
+    @classmethod
+    def parse(cls, count: str | None) -> "StandardBasis":
+        """See `Directions.parse`."""
+        _no_count(cls.name, count)
+        return cls()
+
+    def describe(self) -> str:
+        """See `Directions.describe`."""
+        return self.name
+
     def count(self, dimension: int) -> int:
         """One for each coordinate."""
         return dimension
@@ -66,10 +111,21 @@ class StandardBasis:
 class RandomSphere:
     """`probes` independent directions for each state, uniform on the sphere (TaSIL, appendix)."""
 
-    probes: int
+    probes: int = USUAL_COUNT
+    name: ClassVar[str] = "sphere"
+    exact: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
-        check_directions(self.probes)
+        object.__setattr__(self, "probes", check_count("probes", self.probes))
+
+    @classmethod
+    def parse(cls, count: str | None) -> "RandomSphere":
+        """See `Directions.parse`."""
+        return cls(count_of(count))
+
+    def describe(self) -> str:
+        """See `Directions.describe`."""
+        return f"{self.name}:{self.probes}"
 
     def count(self, dimension: int) -> int:
         """As many as asked for."""
@@ -106,10 +162,21 @@ class OrthogonalFrames:
     """
 
     probes: int | None = None
+    name: ClassVar[str] = "orthogonal"
+    exact: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         if self.probes is not None:
-            check_directions(self.probes)
+            object.__setattr__(self, "probes", check_count("probes", self.probes))
+
+    @classmethod
+    def parse(cls, count: str | None) -> "OrthogonalFrames":
+        """See `Directions.parse`; "all" is one whole frame."""
+        return cls(None if count == "all" else count_of(count))
+
+    def describe(self) -> str:
+        """See `Directions.describe`."""
+        return f"{self.name}:{'all' if self.probes is None else self.probes}"
 
     def count(self, dimension: int) -> int:
         """As many as asked for, or one for each coordinate."""
@@ -139,10 +206,54 @@ class OrthogonalFrames:
         return bank, (frame * dimension + turn % dimension).astype(np.int32)
 
 
-def check_directions(probes: int) -> None:
-    """Raise a SettingError where `probes` is no number of directions."""
-    if isinstance(probes, bool) or not isinstance(probes, int) or probes < 1:
-        raise SettingError(f"probes={probes!r}", "a positive integer", "write probes=10")
+@dataclass(frozen=True)
+class Jacobian:
+    """Whole orthonormal frames along which a differentiable expert is differentiated."""
+
+    name: ClassVar[str] = "jacobian"
+    exact: ClassVar[bool] = True
+
+    @classmethod
+    def parse(cls, count: str | None) -> "Jacobian":
+        """See `Directions.parse`."""
+        _no_count(cls.name, count)
+        return cls()
+
+    def describe(self) -> str:
+        """See `Directions.describe`."""
+        return self.name
+
+    def count(self, dimension: int) -> int:
+        """One for each coordinate."""
+        return dimension
+
+    def reach(self, dimension: int) -> float:
+        """All coordinates move."""
+        return dimension**0.5
+
+    def draw(
+        self, rows: int, states: np.ndarray, random: np.random.Generator
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """See `Directions.draw`."""
+        return OrthogonalFrames().draw(rows, states, random)
+
+
+def count_of(text: str | None) -> int:
+    """Return the count that a design is written with, or the usual one.
+
+    Raises:
+        ValueError: If it is no positive integer.
+    """
+    if text is None:
+        return USUAL_COUNT
+    if not text.isdigit() or int(text) == 0:
+        raise ValueError(f"{text} is no number of directions")
+    return int(text)
+
+
+def _no_count(name: str, count: str | None) -> None:
+    if count is not None:
+        raise ValueError(f"{name} takes no count")
 
 
 def _runs(starts: np.ndarray, length: int, size: int) -> np.ndarray:

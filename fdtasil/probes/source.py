@@ -1,30 +1,30 @@
 """A derivative source: directions, stencil, distance, and when to ask again."""
 
-import re
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
+from fdtasil.checks import check_count, check_number
 from fdtasil.errors import SettingError
 from fdtasil.probes.adaptive import AdaptiveDirections
-from fdtasil.probes.directions import Directions, OrthogonalFrames, RandomSphere, StandardBasis
-from fdtasil.probes.stencils import CENTRAL, EXACT, FORWARD, LABELS, STENCILS, Stencil
+from fdtasil.probes.directions import (
+    Directions,
+    Jacobian,
+    OrthogonalFrames,
+    RandomSphere,
+    StandardBasis,
+)
+from fdtasil.probes.stencils import CENTRAL, EXACT, FORWARD, LABELS, Stencil
 
-__all__ = ["DIRECTIONS", "USUAL_COUNT", "Probes"]
+__all__ = ["DIRECTIONS", "Probes"]
 
-USUAL_COUNT = 10
-"""Probes of a state, where nobody says another number."""
-
-DIRECTIONS: dict[str, Callable[[int | None], Directions]] = {
-    "adaptive": lambda count: AdaptiveDirections(USUAL_COUNT if count is None else count),
-    "basis": lambda count: StandardBasis(),
-    "sphere": lambda count: RandomSphere(USUAL_COUNT if count is None else count),
-    "orthogonal": lambda count: OrthogonalFrames(USUAL_COUNT if count is None else count),
-    "jacobian": lambda count: OrthogonalFrames(),
+DIRECTIONS: dict[str, type[Directions]] = {
+    design.name: design
+    for design in (AdaptiveDirections, StandardBasis, RandomSphere, OrthogonalFrames, Jacobian)
 }
-"""Every design by the name it is written with; the count may be left open."""
+"""Every design by the name it is written with."""
 
 
 @dataclass(frozen=True)
@@ -62,25 +62,22 @@ class Probes:
     per_step: int | Literal["all"] | None = None
 
     def __post_init__(self) -> None:
-        if self.radius is not None and not 0 < self.radius < float("inf"):
-            raise SettingError(
-                f"radius={self.radius!r}", "a positive number", "write for example radius=0.15"
-            )
+        if self.radius is not None:
+            number = check_number("radius", self.radius, positive=True)
+            object.__setattr__(self, "radius", number)
         if self.space not in (None, "whitened", "raw"):
             raise SettingError(f"space={self.space!r}", '"whitened" or "raw"', "choose one")
-        if (self.stencil is EXACT) and self.directions != OrthogonalFrames():
+        if self.directions.exact and self.stencil is None:
+            object.__setattr__(self, "stencil", EXACT)
+        if (self.stencil is EXACT) != self.directions.exact:
+            name = self.stencil.name if self.stencil else "open"
             raise SettingError(
-                f"the exact stencil with {self.directions}",
-                "whole frames, which hold the Jacobian",
-                'write probes="jacobian"',
+                f"the {name} stencil with {self.directions.describe()!r}",
+                "a finite stencil with asked directions, and none with differentiated ones",
+                'write probes="jacobian" for the exact derivative',
             )
         if self.per_step not in (None, "all"):
-            if not isinstance(self.per_step, int) or self.per_step < 1:
-                raise SettingError(
-                    f"per_step={self.per_step!r}",
-                    'a positive integer or "all"',
-                    "write per_step=1",
-                )
+            object.__setattr__(self, "per_step", check_count("per_step", self.per_step))
 
     @staticmethod
     def parse(spec: "int | str | Probes | None") -> "Probes | None":
@@ -88,9 +85,9 @@ class Probes:
 
         Args:
             spec: 0 or "none" (plain behaviour cloning), N (N adaptive directions), or a text
-                `design[:count][,option...]`: designs adaptive, basis, sphere, orthogonal,
-                jacobian; options forward, central, labels, resample, whitened, raw, radius=R,
-                per_step=K. A `Probes` is returned as it is.
+                `design[:count][,option...]`: designs adaptive (a mere number is one), basis,
+                sphere, orthogonal, jacobian; options forward, central, labels, resample,
+                whitened, raw, radius=R, per_step=K. A `Probes` is returned as it is.
 
         Returns:
             The source, or None for plain behaviour cloning.
@@ -110,16 +107,7 @@ class Probes:
 
     def describe(self) -> str:
         """Return the text that `parse` reads back, with the radius where it is set."""
-        design = next(
-            name
-            for name in DIRECTIONS
-            if isinstance(self.directions, type(DIRECTIONS[name](1)))
-            and (name == "jacobian") == (self.stencil is EXACT)
-        )
-        count = getattr(self.directions, "probes", None)
-        if design == "orthogonal" and count is None:
-            count = "all"
-        parts = [design if count is None else f"{design}:{count}"]
+        parts = [self.directions.describe()]
         parts += [self.stencil.name] if self.stencil not in (None, EXACT) else []
         parts += ["resample"] if self.resample else []
         parts += [self.space] if self.space else []
@@ -160,11 +148,11 @@ class Probes:
             visits: How often training visits each state.
         """
         count = self.directions.count(dimension)
-        pools = self.pools(dimension, visits)
-        return pools * states * count * len((self.stencil or CENTRAL).offsets)
+        samples = self.samples(dimension, visits)
+        return samples * states * count * len((self.stencil or CENTRAL).offsets)
 
-    def pools(self, dimension: int, visits: int) -> int:
-        """Return how often the expert is asked for a new set of answers; see `queries`."""
+    def samples(self, dimension: int, visits: int) -> int:
+        """Return how often directions are drawn and the expert is asked; see `queries`."""
         count = self.directions.count(dimension)
         last = (visits - 1) * self.used_per_visit(count) // count
         return last + 1 if self.resample else 1
@@ -182,55 +170,45 @@ def _shortest(number: float) -> str:
 
 _GRAMMAR = 'a number of probes, or a text like "sphere:10,resample", "basis,central", "jacobian"'
 _EXAMPLES = "write for example probes=10, or probes=0 for plain behaviour cloning"
+_FLAGS: dict[str, tuple[str, object]] = {
+    **{stencil.name: ("stencil", stencil) for stencil in (FORWARD, CENTRAL, LABELS)},
+    "resample": ("resample", True),
+    "whitened": ("space", "whitened"),
+    "raw": ("space", "raw"),
+}
+_NUMBERS: dict[str, Callable[[str], object]] = {
+    "radius": float,
+    "per_step": lambda text: text if text == "all" else int(text),
+}
 
 
 def _parse_text(spec: str) -> Probes:
     design, *options = (part.strip() for part in spec.split(","))
-    match = re.fullmatch(r"([a-z]+)(?::(\d+|all))?", design)
-    if not match or match[1] not in DIRECTIONS or match[2] == "0":
-        number = re.fullmatch(r"[-+.\d]+", design) is not None
+    name, colon, count = (f"adaptive:{design}" if design.isdigit() else design).partition(":")
+    if name not in DIRECTIONS:
+        number = not set(name) - set("-+.0123456789")
         advice = _EXAMPLES if number else f"designs: {', '.join(DIRECTIONS)}"
         raise SettingError(f"probes={spec!r}", _GRAMMAR, advice)
-    if match[2] and match[1] in ("basis", "jacobian"):
-        raise SettingError(
-            f"probes={spec!r}: {match[1]} takes no count", _GRAMMAR, f'write "{match[1]}"'
-        )
-    if match[2] == "all":
-        if match[1] != "orthogonal":
-            raise SettingError(f"probes={spec!r}", _GRAMMAR, 'write "basis" or "orthogonal:all"')
-        directions = OrthogonalFrames()
-    else:
-        directions = DIRECTIONS[match[1]](int(match[2]) if match[2] else None)
-    probes = Probes(directions, EXACT if match[1] == "jacobian" else None)
+    try:
+        directions = DIRECTIONS[name].parse(count if colon else None)
+    except ValueError as error:
+        raise SettingError(f"probes={spec!r}: {error}", _GRAMMAR, _EXAMPLES) from None
+    fields: dict[str, Any] = {}
     for option in options:
-        if match[1] == "jacobian" and option in STENCILS:
-            raise SettingError(
-                f"probes={spec!r}", "no stencil: the derivative is exact", _EXAMPLES
-            )
-        probes = replace(probes, **_parse_option(option, spec))
-    return probes
+        fields |= _parse_option(option, spec)
+    if directions.exact and "stencil" in fields:
+        raise SettingError(f"probes={spec!r}", "no stencil: the derivative is exact", _EXAMPLES)
+    return Probes(directions, **fields)
 
 
 def _parse_option(option: str, spec: str) -> dict[str, object]:
     key, _, value = option.partition("=")
-    flags: dict[str, dict[str, object]] = {
-        "forward": {"stencil": FORWARD},
-        "central": {"stencil": CENTRAL},
-        "labels": {"stencil": LABELS},
-        "resample": {"resample": True},
-        "whitened": {"space": "whitened"},
-        "raw": {"space": "raw"},
-    }
-    numbers: dict[str, Callable[[str], object]] = {
-        "radius": float,
-        "per_step": lambda text: text if text == "all" else int(text),
-    }
-    if not value and key in flags:
-        return flags[key]
+    if not value and key in _FLAGS:
+        return dict([_FLAGS[key]])
     try:
-        return {key: numbers[key](value)}
+        return {key: _NUMBERS[key](value)}
     except (KeyError, ValueError):
-        known = ", ".join([*flags, *(f"{name}=..." for name in numbers)])
+        known = ", ".join([*_FLAGS, *(f"{name}=..." for name in _NUMBERS)])
         raise SettingError(
             f"probes={spec!r}: unknown option {option!r}", f"one of {known}", _EXAMPLES
         ) from None

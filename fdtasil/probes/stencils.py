@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-__all__ = ["CENTRAL", "EXACT", "FORWARD", "LABELS", "STENCILS", "Stencil"]
+__all__ = ["CENTRAL", "EXACT", "FORWARD", "LABELS", "Stencil"]
 
 
 @dataclass(frozen=True)
@@ -34,4 +34,3 @@ CENTRAL = Stencil("central", (1.0, -1.0), (0.5, -0.5), 0.0, (1.0, 1.0, -2.0))
 EXACT = Stencil("exact", (), (), 0.0, exact=True)
 LABELS = Stencil("labels", (1.0,), (1.0,), 0.0, differences=False)
 """No difference: the answers are labels of the moved states, as in data augmentation."""
-STENCILS = {stencil.name: stencil for stencil in (FORWARD, CENTRAL, EXACT, LABELS)}

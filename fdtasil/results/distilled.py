@@ -14,14 +14,15 @@ from fdtasil.demonstrations.dataset import Dataset
 from fdtasil.demonstrations.states import Demonstrations
 from fdtasil.errors import SettingError, StorageError
 from fdtasil.experts.expert import rows_text
+from fdtasil.experts.onnx_expert import COLUMNS
 from fdtasil.files.onnx.export import export_module
 from fdtasil.files.storage import to_json, verify, write_bytes, write_folder
 from fdtasil.probes.answers import Answers
 from fdtasil.probes.calibration import Calibration
 from fdtasil.results.evaluation import Evaluation
 from fdtasil.results.figures import draw_calibration, draw_returns, draw_training
-from fdtasil.student.network import Student
-from fdtasil.student.view import COLUMNS, StudentObservation, View
+from fdtasil.student.policy import Student
+from fdtasil.student.view import StudentObservation, View
 
 __all__ = ["Distilled"]
 
@@ -180,7 +181,7 @@ class Distilled:
         metadata = {
             "fdtasil.version": self.report["versions"]["fdtasil"],
             "fdtasil.environment": self.report["env"],
-            "fdtasil.observation_size": str(self.student.shape.observation_size),
+            "fdtasil.observation_size": str(self.student.observation_size),
             "fdtasil.action_low": ",".join(f"{value:g}" for value in low),
             "fdtasil.action_high": ",".join(f"{value:g}" for value in high),
             "fdtasil.expert_sha256": self.report["expert"]["sha256"] or "",

@@ -1,22 +1,21 @@
 """Paired evaluation: student and expert from the same starts, with an interval."""
 
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from fdtasil.errors import FdtasilWarning
+from fdtasil.errors import warn
 from fdtasil.experts.expert import Expert
-from fdtasil.progress import Stages
+from fdtasil.progress import Progress
 from fdtasil.rollouts.behaviours import Policy, follow, random_behaviour
 from fdtasil.rollouts.environments import EnvironmentPool
 from fdtasil.rollouts.episodes import Episodes
 from fdtasil.rollouts.rollout import rollout
 from fdtasil.seeding import generator
 
-__all__ = ["Evaluation", "compare", "interval_text", "score_text"]
+__all__ = ["Evaluation", "evaluate_pair", "interval_text", "score_text"]
 
 _RESAMPLES = 2000
 
@@ -92,14 +91,14 @@ class Evaluation:
         )
 
 
-def compare(
+def evaluate_pair(
     student: Policy,
     expert: Expert,
     expert_episodes: Episodes,
     pool: EnvironmentPool,
     horizon: int,
     seed: int,
-    stages: Stages,
+    progress: Progress,
 ) -> Evaluation:
     """Run a policy from the starts of the expert's episodes, and compare.
 
@@ -110,21 +109,19 @@ def compare(
         pool: The environment.
         horizon: T.
         seed: Of the bootstrap, and of the random actions where they are the reference.
-        stages: Progress bars.
+        progress: Progress bars.
     """
     seeds = [int(s) for s in expert_episodes.seeds]
-    with stages.stage("evaluation", len(seeds) * horizon, "step") as move:
-        student_episodes = rollout(follow(student), pool, seeds, horizon, on_step=move)
+    with progress.bar("evaluation", "step", len(seeds) * horizon) as bar:
+        student_episodes = rollout(follow(student), pool, seeds, horizon, on_step=bar.move)
     reference = _reference_return(expert_episodes, pool, seeds, horizon, seed)
     ours, theirs = student_episodes.returns, expert_episodes.returns
     meaningful = float(theirs.mean()) > reference
     if not meaningful:
         least = "0" if np.median(theirs) > 0 else f"{reference:.4g}, that of random actions"
-        warnings.warn(
+        warn(
             f"the expert's return {theirs.mean():.4g} is not above {least}: no normalised return; "
-            "check that expert and environment belong together",
-            FdtasilWarning,
-            stacklevel=2,
+            "check that expert and environment belong together"
         )
     reset = student_episodes.physics_resets > 0
     if reset.mean() > 0.5:  # more than one start each: not the returns of this policy

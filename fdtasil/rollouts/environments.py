@@ -10,7 +10,7 @@ from types import TracebackType
 import gymnasium
 import numpy as np
 
-from fdtasil.errors import EnvironmentFault, FdtasilWarning, SettingError
+from fdtasil.errors import EnvironmentFault, SettingError, warn
 
 __all__ = ["EnvironmentLike", "EnvironmentPool", "resolve_horizon", "simulator_warnings"]
 
@@ -133,11 +133,7 @@ def resolve_horizon(horizon: int | None, pool: EnvironmentPool) -> int:
         )
     limit = pool.time_limit
     if limit is not None and horizon > limit:
-        warnings.warn(
-            f"horizon={horizon}: {pool.name} ends its episodes at {limit} steps, which is used",
-            FdtasilWarning,
-            stacklevel=3,
-        )
+        warn(f"horizon={horizon}: {pool.name} ends its episodes at {limit} steps, which is used")
         return limit
     return int(horizon)
 
@@ -162,7 +158,7 @@ def simulator_warnings() -> Iterator[None]:
         put(before)
     for message in messages:
         if "deprecated" not in message and "simulation is unstable" not in message:
-            warnings.warn(f"MuJoCo: {message}", FdtasilWarning, stacklevel=4)
+            warn(f"MuJoCo: {message}")
 
 
 def _factory(environment: EnvironmentLike) -> Callable[[], gymnasium.Env]:

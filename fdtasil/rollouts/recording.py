@@ -1,12 +1,11 @@
 """Episodes while they are recorded: every answer of an environment is looked at here."""
 
-import warnings
 from collections.abc import Sequence
 
 import gymnasium
 import numpy as np
 
-from fdtasil.errors import EnvironmentFault, FdtasilWarning
+from fdtasil.errors import EnvironmentFault, warn
 from fdtasil.rollouts.behaviours import Decision
 from fdtasil.rollouts.environments import EnvironmentPool
 from fdtasil.rollouts.episodes import Episodes
@@ -141,11 +140,9 @@ class Recording:
         """Return what was recorded; warn of physics that reset themselves."""
         unstable = np.count_nonzero(self.physics_resets)
         if unstable:
-            warnings.warn(
+            warn(
                 f"{self._name}: the simulation became unstable and reset itself in {unstable} of "
-                f"{len(self._seeds)} episodes; their returns are of more than one start",
-                FdtasilWarning,
-                stacklevel=3,
+                f"{len(self._seeds)} episodes; their returns are of more than one start"
             )
         return Episodes(
             self.observations,

@@ -1,8 +1,9 @@
-"""What a run has cost so far, kept over interruptions: rows asked, warnings, seconds."""
+"""What a run has cost so far, over interruptions: queries, warnings, seconds."""
 
 import time
 from collections import Counter
-from dataclasses import dataclass, field
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 from fdtasil.errors import SettingError
@@ -10,49 +11,75 @@ from fdtasil.errors import SettingError
 __all__ = ["Account"]
 
 
-@dataclass
 class Account:
     """The account of a run, which every checkpoint keeps.
 
-    Attributes:
-        queries: Rows that the expert has answered, by purpose: the expert's own ledger, which it
-            writes; empty where nobody is asked.
-        notes: The library's warnings so far; grows by itself.
-        earlier: Seconds that the interrupted run took for what is taken up from it.
-        started: When this process began, on the clock of `time.perf_counter`.
-        again: Rows asked before a checkpoint was taken up, which the interrupted run has asked
-            and counted too; None in a run that was not interrupted.
+    The ledger only grows, and only the expert writes it. What a run has spent is what its
+    interrupted part had spent, and what the ledger has grown by since that was taken up.
+
+    Args:
+        ledger: Rows that the expert has answered in this process, by purpose.
+        notes: The library's warnings in this process; grows by itself.
     """
 
-    queries: Counter[str] = field(default_factory=Counter)
-    notes: list[str] = field(default_factory=list)
-    earlier: float = 0.0
-    started: float = field(default_factory=time.perf_counter)
-    again: int | None = None
+    def __init__(self, ledger: Mapping[str, int], notes: Sequence[str]) -> None:
+        self._ledger, self._notes = ledger, notes
+        self._earlier: dict[str, Any] = {"queries": {}, "again": 0, "notes": [], "seconds": 0.0}
+        self._before: Mapping[str, int] = {}  # the ledger, when that was taken up
+        self._repeated: Counter[str] = Counter()
+        self._began = time.perf_counter()
+
+    @property
+    def queries(self) -> Counter[str]:
+        """Rows by purpose, each counted once."""
+        spent = Counter(self._earlier["queries"])
+        spent.update(self._ledger)
+        spent.subtract(self._before)
+        spent.subtract(self._repeated)
+        return spent
+
+    @property
+    def again(self) -> int:
+        """Rows that were asked again after an interruption; they are counted nowhere else."""
+        repeated = sum(self._before.values()) + self._repeated.total()
+        return self._earlier["again"] + repeated
+
+    @property
+    def notes(self) -> list[str]:
+        """The warnings, those of the interrupted part first, and none of them twice for it."""
+        earlier = self._earlier["notes"]
+        return [*earlier, *(note for note in self._notes if note not in earlier)]
 
     @property
     def seconds(self) -> float:
-        """Wall-clock seconds so far."""
-        return self.earlier + time.perf_counter() - self.started
+        """Wall-clock seconds of collecting, probing and training."""
+        return self._earlier["seconds"] + time.perf_counter() - self._began
+
+    def start_clock(self) -> None:
+        """Count the seconds from now on."""
+        self._began = time.perf_counter()
 
     def to_json(self) -> dict[str, Any]:
         """Return what a checkpoint keeps."""
+        queries = {purpose: rows for purpose, rows in self.queries.items() if rows}
         return {
-            "queries": dict(self.queries),
-            "notes": list(self.notes),
+            "queries": queries,
+            "again": self.again,
+            "notes": self.notes,
             "seconds": self.seconds,
         }
 
-    def take_up(self, kept: dict[str, Any]) -> None:
-        """Go on from an interrupted run's; what this process asked before counts as again."""
-        if self.again is None:
-            self.again = sum(self.queries.values())
-        self.queries.clear()
-        self.queries.update(kept["queries"])
-        self.queries["again"] += self.again
-        earlier = kept["notes"]
-        self.notes[:] = earlier + [note for note in self.notes if note not in earlier]
-        self.earlier, self.started = kept["seconds"], time.perf_counter()
+    def take_up(self, earlier: dict[str, Any]) -> None:
+        """Go on from a checkpoint; what this process asked before, the interrupted one had too."""
+        self._earlier, self._before = earlier, dict(self._ledger)
+        self.start_clock()
+
+    @contextmanager
+    def asked_before(self) -> Iterator[None]:
+        """Count what is asked inside the block as asked again: the interrupted part counted it."""
+        before = Counter(self._ledger)
+        yield
+        self._repeated.update(Counter(self._ledger) - before)
 
     def check_budget(self, rows: int, most: int | None) -> None:
         """Refuse to ask beyond the budget: early ends make a resampling source ask more often.
@@ -62,10 +89,10 @@ class Account:
         Raises:
             SettingError: If `rows` more are more than `most` in all.
         """
-        asked = sum(count for purpose, count in self.queries.items() if purpose != "again")
+        asked = self.queries.total()
         if most is not None and asked + rows > most:
             raise SettingError(
-                f"{asked:,} rows are asked, and {rows:,} more are due",
+                f"{asked:,} queries are asked, and {rows:,} more are due",
                 f"at most max_queries={most:,}",
                 "raise max_queries, or leave out resample",
             )

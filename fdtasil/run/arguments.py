@@ -1,78 +1,214 @@
-"""From the arguments of `distill` to one configuration."""
+"""From the arguments of `distill` to one configuration: looked at first, resolved when opened."""
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
+from fdtasil.checks import check_count
 from fdtasil.demonstrations.dataset import Dataset
-from fdtasil.demonstrations.trainers import Trainer, trainer_of
+from fdtasil.demonstrations.trainers import BehaviourCloning, Trainer, trainer_of
 from fdtasil.errors import SettingError
+from fdtasil.files.storage import sha256
+from fdtasil.probes.directions import USUAL_COUNT
 from fdtasil.probes.source import Probes
 from fdtasil.probes.stencils import EXACT, FORWARD
-from fdtasil.run.presets import Preset
+from fdtasil.rollouts.environments import resolve_horizon
+from fdtasil.run.configuration import Configuration
+from fdtasil.run.presets import Preset, preset_of
+from fdtasil.run.subject import Subject
+from fdtasil.student.architectures import Architecture
+from fdtasil.student.fit import Fit
+from fdtasil.student.view import StudentObservation, describe_view
+
+__all__ = ["Arguments", "read_arguments"]
+
+_USUAL_EPISODES = 20
 
 
-def source_of(
-    spec: int | str | Probes,
+@dataclass(frozen=True)
+class Arguments:
+    """What a caller asks for, looked at before anything is opened.
+
+    Attributes:
+        given: The dataset, or None.
+        preset: Where the defaults come from.
+        probes: The derivative source, but for what a calibration finds; None for cloning.
+        trainer: Who acts in which round; None where the dataset is given.
+        episodes: Number of demonstrations.
+        horizon: T, or None for the environment's own.
+        seed: The one seed.
+        student: The architecture of its network.
+        student_obs: What it sees.
+        fit: The optimisation.
+        evaluation_episodes: Paired episodes, where there is something to compare.
+        max_queries: The most that the expert may be asked, or None.
+        device: Where the student is trained.
+    """
+
+    given: Dataset | None
+    preset: Preset
+    probes: Probes | None
+    trainer: Trainer | None
+    episodes: int
+    horizon: int | None
+    seed: int
+    student: Architecture
+    student_obs: StudentObservation | None
+    fit: Fit
+    evaluation_episodes: int
+    max_queries: int | None
+    device: str
+
+    def configure(self, subject: Subject) -> Configuration:
+        """Return the configuration of a run with an expert and an environment.
+
+        Raises:
+            SettingError: If the environment allows no such horizon.
+        """
+        given, source, expert = self.given, self.probes, subject.expert
+        stored = given is not None and given.answers is not None
+        calibrates = source is not None and self.preset.calibrates(source)
+        return Configuration(
+            expert=(expert.source or expert.name) if expert else None,
+            expert_sha256=expert.sha256 if expert else None,
+            env=subject.environment,
+            trainer=self.trainer,
+            dataset=sha256(given.to_bytes()) if given else None,
+            states=len(given.demonstrations) if given else None,
+            probes=source,
+            calibrated=calibrates and not stored and expert is not None,
+            usual_radius=self.preset.radius,
+            probes_given=stored,
+            observation_size=subject.observation_size,
+            student_obs=describe_view(self.student_obs),
+            student=self.student,
+            fit=self.fit,
+            episodes=self.episodes,
+            horizon=resolve_horizon(self.horizon, subject.pool) if subject.pool else 0,
+            seed=self.seed,
+            device=self.device,
+            evaluation_episodes=self.evaluation_episodes if subject.comparable else 0,
+            max_queries=self.max_queries,
+        )
+
+
+def read_arguments(
+    given: Dataset | None,
+    probes: int | str | Probes | None,
+    *,
+    trainer: str | Trainer,
+    episodes: int | None,
+    horizon: int | None,
+    seed: int,
+    student: Architecture,
+    student_obs: StudentObservation | None,
+    fit: Fit | None,
+    preset: str,
+    evaluation_episodes: int,
+    max_queries: int | None,
+    device: str,
+) -> Arguments:
+    """Look at the arguments of `distill`, which say what each is.
+
+    Raises:
+        SettingError: If one can't be used, or two don't go together.
+    """
+    defaults = preset_of(preset)
+    fit = defaults.fit if fit is None else fit
+    if max_queries is not None:
+        check_count("max_queries", max_queries, least=0)
+    return Arguments(
+        given=given,
+        preset=defaults,
+        probes=_source_of(probes, defaults, fit.order, given, curved=callable(student_obs)),
+        trainer=_trainer_of(trainer, given),
+        episodes=_episodes_of(episodes, given),
+        horizon=None if horizon is None else check_count("horizon", horizon),
+        seed=check_count("seed", seed, 0, 2**32 - 1),
+        student=student,
+        student_obs=student_obs,
+        fit=fit,
+        evaluation_episodes=check_count("evaluation_episodes", evaluation_episodes, least=0),
+        max_queries=max_queries,
+        device=device,
+    )
+
+
+def _source_of(
+    spec: int | str | Probes | None,
     preset: Preset,
     order: int,
     given: Dataset | None,
     *,
-    usual: int | str,
+    curved: bool,
 ) -> Probes | None:
     """Return the derivative source of a run: what is asked for, or what is stored.
 
     Args:
-        spec: The argument `probes`.
+        spec: The argument `probes`; None takes what is stored, else the usual number.
         preset: Fills in what it leaves open.
         order: Of the Taylor loss.
-        given: Demonstrations; their stored answers are used as they are.
-        usual: The value of `spec` that means nothing was said.
-
-    Returns:
-        The source, or None for plain behaviour cloning.
+        given: A dataset; its stored answers are used as they are.
+        curved: Whether the student may see a curved function of the observation, which allows
+            the forward stencil only.
 
     Raises:
         SettingError: If order, source and stored answers do not go together.
     """
-    if order not in (1, 2) or isinstance(order, bool):
-        raise SettingError(f"order={order!r}", "1 or 2 (probes=0 is order 0)", "write order=1")
-    asked = preset.complete(Probes.parse(spec))
-    stored = given.probes if given is not None else None
+    stored = given.probes if given is not None and given.answers is not None else None
+    if spec is None and stored is not None:
+        return _from_store(stored, order, given)
+    asked = preset.complete(Probes.parse(USUAL_COUNT if spec is None else spec))
     if asked is None:
         return None
-    if given is None or stored is None or given.answers is None:
-        return asked.with_order(order, None if preset.calibrates(asked) else FORWARD)
+    if stored is None:
+        left_open = preset.calibrates(asked) and not curved
+        return asked.with_order(order, None if left_open else FORWARD)
     asked = replace(  # what was left open was found by a calibration, and is stored
         asked, radius=asked.radius or stored.radius, stencil=asked.stencil or stored.stencil
     ).with_order(order)
-    if spec != usual and asked != stored:
+    if asked != stored:
         raise SettingError(
             f"probes={asked.describe()!r} with stored answers to {stored.describe()!r}",
             "the source that is stored, or probes=0",
             "leave probes= out, or record demonstrations of its own",
         )
-    if order == 2 and stored.stencil is EXACT and given.answers.values.shape[2] < 2:
+    return _from_store(stored, order, given)
+
+
+def _from_store(stored: Probes, order: int, given: Dataset | None) -> Probes:
+    """Return the source of stored answers: nobody is asked anew."""
+    values = given.answers.values if given is not None and given.answers is not None else None
+    if order == 2 and stored.stencil is EXACT and values is not None and values.shape[2] < 2:
         raise SettingError(
             "order=2 with stored derivatives of first order",
-            "demonstrations made with order=2",
-            "record them with order=2, or pass order=1",
+            "a dataset made with order=2",
+            "record one with order=2, or pass order=1",
         )
-    # Nobody is asked anew: stored answers are what there is.
     return replace(stored.with_order(order), resample=False)
 
 
-def trainer_for(trainer: str | Trainer, given: Dataset | None) -> Trainer | None:
-    """Return who acts in which round; nobody does where the demonstrations are given.
-
-    Raises:
-        SettingError: If there is no such trainer, or one is asked for that has nothing to do.
-    """
+def _trainer_of(trainer: str | Trainer, given: Dataset | None) -> Trainer | None:
+    """Return who acts in which round; nobody does where the dataset is given."""
     chosen = trainer_of(trainer)
     if given is None:
         return chosen
-    if chosen.name != "bc":
+    if not isinstance(chosen, BehaviourCloning):
         raise SettingError(
-            f"trainer={chosen.name!r} with given demonstrations",
+            f"trainer={chosen.name!r} with a given dataset",
             "nobody who acts: nothing is recorded",
-            "leave trainer= out, or leave demonstrations= out",
+            "leave trainer= out, or leave dataset= out",
         )
     return None
+
+
+def _episodes_of(episodes: int | None, given: Dataset | None) -> int:
+    """Return the number of demonstrations; a dataset says it itself."""
+    if given is None:
+        return check_count("episodes", _USUAL_EPISODES if episodes is None else episodes)
+    found = given.demonstrations.episodes
+    if episodes not in (None, found):
+        raise SettingError(
+            f"episodes={episodes!r} with a dataset of {found} episodes",
+            "all that are given",
+            "leave episodes= out",
+        )
+    return found

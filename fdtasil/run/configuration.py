@@ -1,14 +1,16 @@
 """A run's resolved configuration: every choice made, in one frozen place."""
 
+import json
 from dataclasses import asdict, dataclass
 from typing import Any
 
 from fdtasil.demonstrations.trainers import Trainer, describe_trainer
 from fdtasil.errors import SettingError
 from fdtasil.experts.expert import rows_text
-from fdtasil.experts.gate import _ROWS_A_STATE, GATE_STATES
+from fdtasil.experts.gate import GATE_QUERIES
 from fdtasil.probes.calibration import Ladder, ladder_for
 from fdtasil.probes.source import Probes
+from fdtasil.student.architectures import Architecture, describe
 from fdtasil.student.fit import Fit
 
 __all__ = ["Configuration"]
@@ -22,18 +24,16 @@ class Configuration:
         expert: What the expert is called, or None where there is none.
         expert_sha256: Of its file, or None.
         env: What the environment is called.
-        trainer: Who acts in which round; None where the demonstrations are given.
-        demonstrations: sha256 of given demonstrations, or None.
+        trainer: Who acts in which round; None where the dataset is given.
+        dataset: sha256 of a given dataset, or None.
         states: Number of given states, or None.
         probes: The derivative source, or None for plain behaviour cloning.
         calibrated: Whether the expert is asked at many radii, for what the source leaves open.
         usual_radius: Where such a calibration begins.
-        probes_given: Whether the answers to the probes are given with the demonstrations.
-        order: 0, 1 or 2, the order of the Taylor loss.
+        probes_given: Whether the answers to the probes are given with the dataset.
         observation_size: n, of the expert.
         student_obs: The student's coordinates, or what its function is called, or None for all.
-        hidden: Widths of the student's hidden layers.
-        activation: Of the student.
+        student: The architecture of its network.
         fit: The optimisation.
         episodes: Number of demonstrations, recorded or given.
         horizon: T, steps after which an episode is cut; 0 without an environment.
@@ -47,17 +47,15 @@ class Configuration:
     expert_sha256: str | None
     env: str
     trainer: Trainer | None
-    demonstrations: str | None
+    dataset: str | None
     states: int | None
     probes: Probes | None
     calibrated: bool
     usual_radius: float
     probes_given: bool
-    order: int
     observation_size: int
     student_obs: tuple[int, ...] | str | None
-    hidden: tuple[int, ...]
-    activation: str
+    student: Architecture
     fit: Fit
     episodes: int
     horizon: int
@@ -71,13 +69,13 @@ class Configuration:
 
         Exact where no episode ends early and every coordinate moves; an upper bound elsewhere,
         but for a source that resamples: fewer states are visited more often, each time with new
-        questions, which only `max_queries` bounds.
+        queries, which only `max_queries` bounds.
         """
         purposes = ("check", "act", "label", "calibrate", "probe", "evaluate")
         found: dict[str, int] = dict.fromkeys(purposes, 0)
         if self.expert is not None and self.horizon:
             gates = 2 if self.evaluation_episodes else 1
-            found["check"] = gates * GATE_STATES * _ROWS_A_STATE
+            found["check"] = gates * GATE_QUERIES
             found["evaluate"] = 2 * self.evaluation_episodes * self.horizon
         if self.trainer is not None:
             found |= self.trainer.queries(self.episodes, self.horizon)
@@ -85,6 +83,16 @@ class Configuration:
             found["probe"] = self._predicted_probes(self.probes)
             found["calibrate"] = self.ladder.queries if self.calibrated else 0
         return found
+
+    @property
+    def order(self) -> int:
+        """0, 1 or 2, the order of the Taylor loss."""
+        return self.fit.order if self.probes else 0
+
+    @property
+    def rounds(self) -> list[int]:
+        """Number of episodes of each round; one round of all where they are given."""
+        return self.trainer.rounds(self.episodes) if self.trainer else [self.episodes]
 
     @property
     def ladder(self) -> Ladder:
@@ -108,32 +116,31 @@ class Configuration:
         )
 
     def to_json(self) -> dict[str, Any]:
-        """Return the configuration as plain JSON values."""
-        plain = {
-            name: list(value) if isinstance(value, tuple) else value
-            for name, value in vars(self).items()
-            if isinstance(value, (str, int, float, tuple, type(None)))
-        }
-        return plain | {
+        """Return the configuration as plain JSON values, every field of it."""
+        written = {
             "trainer": describe_trainer(self.trainer) if self.trainer else "none",
             "probes": self.probes.describe() if self.probes else "none",
+            "student": describe(self.student),
             "fit": asdict(self.fit),
         }
+        whole = {name: written.get(name, value) for name, value in vars(self).items()}
+        return json.loads(
+            json.dumps(whole, allow_nan=False)
+        )  # raises where JSON has no such value
 
     def _predicted_probes(self, probes: Probes) -> int:
         """Return the probe rows of all rounds.
 
         New states are asked about once; a source that resamples asks about all states again, for
-        every pool but the first of every round.
+        every sample but the first of every round.
         """
-        counts = self.trainer.rounds(self.episodes) if self.trainer else [self.episodes]
         length = self.horizon if self.states is None else self.states / self.episodes
         collected, episodes, total = 0, 0, 0
-        for count in counts:
+        for count in self.rounds:
             new = round(count * length)
             collected, episodes = collected + new, episodes + count
             held = round(self.fit.held_out(episodes) * length)
             once = probes.queries(1, self.observation_size, visits=1)
-            pools = probes.pools(self.observation_size, self.fit.visits(collected - held))
-            total += once * new + once * collected * (pools - 1)
+            samples = probes.samples(self.observation_size, self.fit.visits(collected - held))
+            total += once * new + once * collected * (samples - 1)
         return total

@@ -2,14 +2,15 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
 
 from fdtasil.errors import SettingError
 from fdtasil.results.evaluation import Evaluation
-from fdtasil.student.network import Student
+from fdtasil.student.policy import Student
 
-__all__ = ["Callback", "Event", "tell_all"]
+__all__ = ["Callback", "Event", "Log", "tell_all"]
 
 
 @dataclass(frozen=True)
@@ -37,64 +38,68 @@ class Event:
 Callback = Callable[[Event], None]
 
 
-def tell_all(callback: Callback | None, formats: Sequence[str], folder: Path | None) -> Callback:
-    """Return one callback that tells the caller's and stable-baselines3's logger.
-
-    Raises:
-        SettingError: If formats are asked for without a folder, or one can't be had.
-    """
-    if formats and folder is None:
-        raise SettingError(
-            f"log_formats={tuple(formats)!r} without a folder", "out=", 'write out="runs/mine"'
-        )
-    log = None
-    if formats and folder is not None:
-        # A resumed run logs into a folder of its own: the logger begins its files anew.
-        earlier = len(list(folder.glob("log*")))
-        log = open_log(folder / (f"log-{earlier + 1}" if earlier else "log"), formats)
+def tell_all(callback: Callback | Sequence[Callback] | None) -> Callback:
+    """Return one callback that tells all."""
+    callbacks = [callback] if callable(callback) else list(callback or ())
 
     def tell(event: Event) -> None:
-        if log is not None:
-            values: dict[str, object] = {f"train/{k}": v for k, v in event.entry.items()}
-            if event.evaluation is not None:
-                numbers = event.evaluation.to_json().items()
-                values |= {f"eval/{k}": v for k, v in numbers if isinstance(v, float)}
-            if event.kind != "round":
-                log(event.step, values)
-        if callback is not None:
-            callback(event)
+        for one in callbacks:
+            one(event)
 
     return tell
 
 
-FORMATS = ("stdout", "log", "csv", "json", "tensorboard")
-
-
-def open_log(folder: Path, formats: Sequence[str]) -> Callable[[int, dict[str, Any]], None]:
-    """Return a function that logs values at a training step.
+class Log:
+    """A callback that writes stable-baselines3's logs: losses, and the evaluation at the end.
 
     Args:
-        folder: Where the files go: progress.csv, progress.json, log.txt, events.out.tfevents...
-        formats: Some of `FORMATS`; "tensorboard" needs the package tensorboard (`[tb]`).
+        folder: Where the files go: progress.csv, progress.json, log.txt, events.out.tfevents... If
+            it is there already, one beside it is taken, since a logger begins its files anew.
+        *formats: Some of "stdout", "log", "csv", "json", "tensorboard"; the last one needs the
+            package tensorboard (`[tb]`).
 
     Raises:
         SettingError: If a format is unknown or its package is missing.
+
+    Example::
+
+        fdtasil.distill(expert, env, callback=fdtasil.Log("runs/walker/log", "csv"))
     """
-    unknown = sorted(set(formats) - set(FORMATS))
-    if unknown:
-        raise SettingError(f"log_formats: {', '.join(unknown)}", f"some of {FORMATS}", "choose")
-    from stable_baselines3.common import logger
 
-    try:
-        log = logger.configure(str(folder), list(formats))
-    except (ImportError, AssertionError) as error:
-        raise SettingError(
-            f"log_formats: {error}", "the package tensorboard", 'pip install "fdtasil[tb]"'
-        ) from error
+    def __init__(self, folder: str | Path, *formats: str) -> None:
+        unknown = sorted(set(formats) - set(_FORMATS))
+        if unknown or not formats:
+            found = f"log formats: {', '.join(unknown) or 'none'}"
+            raise SettingError(found, f"some of {', '.join(_FORMATS)}", 'write for example "csv"')
+        if "tensorboard" in formats and find_spec("tensorboard") is None:
+            raise SettingError(
+                "the log format tensorboard without its package",
+                "the package tensorboard",
+                'pip install "fdtasil[tb]"',
+            )
+        self._folder, self._formats = Path(folder), formats
+        self._logger: Any = None
 
-    def write(step: int, values: dict[str, Any]) -> None:
+    def __call__(self, event: Event) -> None:
+        """Write what an event says."""
+        if event.kind == "round":
+            return  # its entry has been told
+        if self._logger is None:
+            self._logger = self._open()
+        values: dict[str, object] = {f"train/{name}": v for name, v in event.entry.items()}
+        if event.evaluation is not None:
+            numbers = event.evaluation.to_json().items()
+            values |= {f"eval/{name}": v for name, v in numbers if isinstance(v, float)}
         for name, value in values.items():
-            log.record(name, value)
-        log.dump(step)
+            self._logger.record(name, value)
+        self._logger.dump(event.step)
 
-    return write
+    def _open(self) -> Any:
+        from stable_baselines3.common import logger
+
+        beside = [self._folder.with_name(f"{self._folder.name}-{n}") for n in range(2, 1000)]
+        folder = next(path for path in (self._folder, *beside) if not path.exists())
+        return logger.configure(str(folder), list(self._formats))
+
+
+_FORMATS = ("stdout", "log", "csv", "json", "tensorboard")

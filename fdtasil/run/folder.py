@@ -3,13 +3,12 @@
 import json
 import shutil
 import time
-import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from fdtasil.errors import FdtasilWarning, SettingError, StorageError
+from fdtasil.errors import SettingError, StorageError, warn
 from fdtasil.files.lock import locked
 from fdtasil.files.storage import is_written, to_json, verify, write_bytes, write_folder
 
@@ -129,7 +128,7 @@ class RunFolder:
                 return verify(folder)
             except StorageError as error:
                 message = f"{error.found}: an earlier checkpoint is used"
-                warnings.warn(message, FdtasilWarning, stacklevel=2)
+                warn(message)
         return None
 
     def close(self) -> None:
@@ -166,7 +165,7 @@ def _check_same(
     if surroundings and not finished:
         found = "; ".join(surroundings)
         message = f"resumed with other versions or on another device, so bytes may differ: {found}"
-        warnings.warn(message, FdtasilWarning, stacklevel=4)
+        warn(message)
 
 
 def _differences(before: Any, now: Any, name: str = "") -> list[str]:

@@ -1,9 +1,7 @@
-"""Every default of the method, written once; a preset is a named set of them."""
+"""The defaults of a derivative source and of the optimisation; a preset is a named set of them."""
 
 from dataclasses import dataclass, replace
 from typing import Any, Literal
-
-import numpy as np
 
 from fdtasil.errors import SettingError
 from fdtasil.probes.adaptive import AdaptiveDirections
@@ -25,8 +23,6 @@ class Preset:
             and the directions may look at the states.
         space: Of the probes.
         per_step: Of the probes.
-        hidden: Widths of the student's hidden layers.
-        activation: The student's.
         fit: The optimisation.
     """
 
@@ -34,8 +30,6 @@ class Preset:
     calibrated: bool
     space: Literal["whitened", "raw"]
     per_step: int | Literal["all"]
-    hidden: tuple[int, ...]
-    activation: str
     fit: Fit
 
     def complete(self, probes: Probes | None) -> Probes | None:
@@ -56,44 +50,17 @@ class Preset:
         """Return whether what the source leaves open is found by asking the expert."""
         return self.calibrated and not probes.exact and probes.space == "whitened"
 
-    def fit_with(self, **given: float | None) -> Fit:
+    def fit_with(self, **given: Any) -> Fit:
         """Return the optimisation with the fields of `Fit` that are given (not None) put in."""
-        changes: dict[str, Any] = {
-            # numpy's numbers are as good as Python's, but no JSON
-            name: value.item() if isinstance(value, np.generic) else value
-            for name, value in given.items()
-            if value is not None
-        }
-        # Steps and epochs are two ways to say one thing: saying one unsays the other, and what is
-        # said holds for any number of states.
+        changes = {name: value for name, value in given.items() if value is not None}
+        # Steps and epochs are two ways to say one thing: saying one unsays the other.
         if "steps" in changes or "epochs" in changes:
-            changes = {"steps": None, "steps_for": None, "epochs": None, **changes}
+            changes = {"steps": None, "epochs": None, **changes}
         return replace(self.fit, **changes)
 
 
 PRESETS = {
-    "standard": Preset(
-        radius=0.3,
-        calibrated=True,
-        space="whitened",
-        per_step=1,
-        hidden=(512, 512),
-        activation="gelu",
-        fit=Fit(
-            steps=4000,
-            steps_for=1500,
-            epochs=None,
-            batch_size=100,
-            learning_rate=1e-3,
-            weight_decay=0.01,
-            epsilon=1e-8,
-            weight=0.5,
-            curvature_weight=0.125,
-            max_gradient_norm=None,
-            validation=0.0,
-            patience=None,
-        ),
-    ),
+    "standard": Preset(radius=0.3, calibrated=True, space="whitened", per_step=1, fit=Fit()),
     # TaSIL, appendices on experiments and finite differences. The weight multiplies the norm of
     # the whole Jacobian's error there; `gain` makes it mean that for any number of probes here.
     "paper": Preset(
@@ -101,22 +68,7 @@ PRESETS = {
         calibrated=False,
         space="raw",
         per_step="all",
-        hidden=(512, 512),
-        activation="gelu",
-        fit=Fit(
-            steps=None,
-            steps_for=None,
-            epochs=4500,
-            batch_size=100,
-            learning_rate=1e-3,
-            weight_decay=0.01,
-            epsilon=1e-4,
-            weight=0.01,
-            curvature_weight=0.01,
-            max_gradient_norm=None,
-            validation=0.0,
-            patience=None,
-        ),
+        fit=Fit(epochs=4500, epsilon=1e-4, weight=0.01, curvature_weight=0.01),
     ),
 }
 

@@ -8,25 +8,30 @@ from dataclasses import replace
 from importlib.metadata import version
 from typing import Any
 
+import fdtasil
 from fdtasil.errors import FdtasilWarning
 from fdtasil.results.evaluation import Evaluation
+from fdtasil.run.checkpoints import Checkpoints
 from fdtasil.run.configuration import Configuration
-from fdtasil.run.state import RunState
+from fdtasil.run.lesson import Lesson
 
 __all__ = ["noted_warnings", "report_of", "versions"]
 
-_VERSIONED = ("fdtasil", "torch", "numpy", "gymnasium", "mujoco", "onnx", "onnxruntime")
+_VERSIONED = ("torch", "numpy", "gymnasium", "mujoco", "onnx", "onnxruntime")
 
 
 def versions() -> dict[str, str]:
     """Return the versions that a run's bytes depend on."""
-    return {"python": platform.python_version()} | {name: version(name) for name in _VERSIONED}
+    ours = {"python": platform.python_version(), "fdtasil": fdtasil.__version__}
+    return ours | {name: version(name) for name in _VERSIONED}
 
 
 def report_of(
-    configuration: Configuration,
+    run: Configuration,
     evaluation: Evaluation | None,
-    state: RunState,
+    lesson: Lesson,
+    steps: int,
+    checkpoints: Checkpoints,
     *,
     train_seconds: float,
     matmul_precision: str,
@@ -34,24 +39,26 @@ def report_of(
     """Return what `report.json` holds, as plain JSON values.
 
     Args:
-        configuration: The run's.
+        run: The configuration.
         evaluation: Student against expert, or None where they could not be compared.
-        state: After the last round.
+        lesson: What the last round learnt from.
+        steps: Gradient steps of all rounds.
+        checkpoints: Know the account and the calibration.
         train_seconds: Wall-clock seconds of collecting, probing and training, those of the
             interrupted run for what was taken up included.
         matmul_precision: torch's float32 matrix-product precision in force.
     """
-    plain = configuration.to_json()
-    source, calibration = state.source, state.calibration
+    plain, account = run.to_json(), checkpoints.account
+    source, calibration = checkpoints.asking.source, checkpoints.asking.calibration
     # The ladder was chosen before it was known what it finds.
-    predicted = replace(configuration, probes=source).predicted_queries() | {
-        "calibrate": configuration.predicted_queries()["calibrate"]
+    predicted = replace(run, probes=source).predicted_queries() | {
+        "calibrate": run.predicted_queries()["calibrate"]
     }
-    asked = state.account.queries
+    counts = ("clipped_actions", "physics_resets", "terminated_episodes")
     return {
         "expert": {
-            "path": configuration.expert,
-            "sha256": configuration.expert_sha256,
+            "path": run.expert,
+            "sha256": run.expert_sha256,
             "return_mean": evaluation.expert_return if evaluation else None,
         },
         **{name: plain[name] for name in ("env", "trainer", "seed")},
@@ -60,18 +67,16 @@ def report_of(
         "calibration": calibration.to_json() if calibration else None,
         "versions": versions(),
         "evaluation": evaluation.to_json() if evaluation else None,
-        "queries": {name: asked[name] for name in predicted},
+        "queries": {name: account.queries[name] for name in predicted},
         "predicted_queries": predicted,
-        "rows_asked_again_after_resuming": asked["again"],
-        "states": len(state.data.demonstrations),
-        "frozen_coordinates": int((~state.scales.live).sum()),
-        "clipped_actions": state.counts["clipped_actions"],
-        "physics_resets": state.counts["physics_resets"],
-        "terminated_episodes": state.counts["terminated_episodes"],
-        "steps": state.steps,
+        "rows_asked_again_after_resuming": account.again,
+        "states": len(lesson.dataset.demonstrations),
+        "frozen_coordinates": int((~lesson.scales.live).sum()),
+        **{name: lesson.collected.counts.get(name, 0) for name in counts},
+        "steps": steps,
         "train_seconds": round(train_seconds, 2),
         "matmul_precision": matmul_precision,
-        "warnings": state.account.notes,
+        "warnings": account.notes,
     }
 
 

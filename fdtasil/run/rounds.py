@@ -1,115 +1,150 @@
 """The rounds of a run: collect, label, probe, train; each stage is kept before the next begins."""
 
+from collections import Counter
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from fdtasil.demonstrations.dataset import Dataset
-from fdtasil.demonstrations.states import label
-from fdtasil.demonstrations.trainers import Situation
-from fdtasil.probes.answers import Answers
-from fdtasil.rollouts.behaviours import Behaviour
-from fdtasil.rollouts.environments import EnvironmentPool
-from fdtasil.rollouts.episodes import Episodes, check_episodes
-from fdtasil.rollouts.rollout import rollout
-from fdtasil.run.events import Event
-from fdtasil.run.state import RunState
+from fdtasil.probes.answers import Answers, Beginning
+from fdtasil.progress import Progress
+from fdtasil.rollouts.behaviours import Policy
+from fdtasil.run.asking import Asking
+from fdtasil.run.checkpoints import (
+    ASKED,
+    COLLECTED,
+    RECORDED,
+    TRAINED,
+    Checkpoints,
+    Collected,
+    Trained,
+)
+from fdtasil.run.collecting import Collecting
+from fdtasil.run.configuration import Configuration
+from fdtasil.run.events import Callback, Event
+from fdtasil.run.lesson import Lesson
 from fdtasil.run.training import Training
-from fdtasil.seeding import episode_seeds, generator
+from fdtasil.student.view import StudentObservation
 
 __all__ = ["Rounds"]
 
 
 @dataclass(frozen=True)
 class Rounds:
-    """In which order the state of a run grows.
+    """In which order a run does what.
 
     Attributes:
-        pool: The environment; None where nothing has to be recorded.
-        training: Makes each round's student, and holds what grows.
+        run: The configuration.
+        student_obs: What the student sees; None for everything.
+        collecting: Records; None where the dataset is given.
+        asking: Asks the probes.
+        training: Makes each round's student.
+        checkpoints: Keep every stage.
+        progress: Progress bars.
+        callback: Told of each round.
     """
 
-    pool: EnvironmentPool | None
+    run: Configuration
+    student_obs: StudentObservation | None
+    collecting: Collecting | None
+    asking: Asking
     training: Training
+    checkpoints: Checkpoints
+    progress: Progress
+    callback: Callback
 
-    @property
-    def state(self) -> RunState:
-        """What grows."""
-        return self.training.state
+    def complete(self, given: Dataset | None) -> tuple[Lesson, Trained]:
+        """Do every round, beginning where the folder's checkpoints end.
 
-    def all(self) -> None:
-        """Do every round, beginning where the folder's checkpoints end."""
-        state, run = self.state, self.state.run
-        counts = run.trainer.rounds(run.episodes) if run.trainer else [0]
-        for round_, count in enumerate(counts):
-            if not state.restore_collected(round_):
-                if run.trainer:
-                    self._collect(round_, count)
-                elif run.probes and not run.probes_given:
-                    self._probe(state.data.demonstrations.observations, 0, None)
-                state.keep_collected(round_)
-            if not state.restore_trained(round_):
-                with self.training.interrupts.held_back():
-                    self.training.round(round_)
-                    state.keep_trained(round_)
-            event = Event("round", round_, state.steps, state.history[-1], state.student)
-            self.training.callback(event)
+        Args:
+            given: The dataset, where nothing is recorded.
 
-    def _collect(self, round_: int, count: int) -> None:
-        """Record `count` episodes, label their states and ask the probes around them."""
-        state, before = self.state, self.state.dataset
-        recorded = state.restore_recorded(round_)
-        if recorded is None:
-            recorded = self._labelled(round_, count)
-            if state.run.probes is not None:  # else the round is kept as a whole in a moment
-                state.keep_recorded(round_, recorded)
-        new, state.dataset, old = recorded.demonstrations, recorded, None
+        Returns:
+            What the last round learnt from, and what it came to.
+        """
+        collected = None if given is None else Collected(given, 0, Counter())
+        lesson, trained = None, None
+        for round_, count in enumerate(self.run.rounds):
+            policy = lesson.view.policy(trained.student.act) if lesson and trained else None
+            collected = self._collected(round_, count, collected, lesson, policy)
+            lesson = Lesson.of(collected, self.student_obs, lesson)
+            trained = self._trained(round_, lesson, trained)
+            last = trained.history[-1]
+            self.callback(Event("round", round_, trained.steps, last, trained.student))
+        assert lesson is not None
+        assert trained is not None, "every run has a round"
+        return lesson, trained
+
+    def _trained(self, round_: int, lesson: Lesson, before: Trained | None) -> Trained:
+        with self.training.interrupts.held_back():
+            return self.checkpoints.once(
+                round_, TRAINED, lambda: self.training.train(round_, lesson, before)
+            )
+
+    def _collected(
+        self,
+        round_: int,
+        count: int,
+        before: Collected | None,
+        lesson: Lesson | None,
+        student: Policy | None,
+    ) -> Collected:
+        """Return all that a round learns from: recorded, labelled, and probed around."""
+
+        def collect() -> Collected:
+            if self.collecting is None:
+                assert before is not None, "the dataset is given"
+                asks = self.run.probes is not None and not self.run.probes_given
+                return self._probed(round_, before, None, lesson) if asks else before
+            new = self._recorded(self.collecting, round_, count, before, student)
+            return self._probed(round_, new, before, lesson)
+
+        return self.checkpoints.once(round_, COLLECTED, collect)
+
+    def _recorded(
+        self,
+        collecting: Collecting,
+        round_: int,
+        count: int,
+        before: Collected | None,
+        student: Policy | None,
+    ) -> Collected:
+        def record() -> Collected:
+            return collecting.record(round_, count, before, student)
+
+        if self.run.probes is None:
+            return record()  # the round is kept as a whole in a moment
+        return self.checkpoints.once(round_, RECORDED, record)
+
+    def _probed(
+        self, round_: int, new: Collected, before: Collected | None, lesson: Lesson | None
+    ) -> Collected:
+        """Join what is new with what was there before, and ask the probes around the new."""
+        states, old = new.dataset.demonstrations, None
+        whole = new
         if before is not None:
-            state.dataset = replace(before, demonstrations=before.demonstrations + new)
-            old = before.answers
-        if state.run.probes is not None:
-            self._probe(new.observations, round_, old)
-
-    def _labelled(self, round_: int, count: int) -> Dataset:
-        """Record `count` episodes and label their states."""
-        state, pool = self.state, self.pool
-        assert state.expert is not None
-        assert pool is not None
-        recorded = self._record(
-            pool, self._behaviour(pool, round_), "rollout", state.episodes, count
+            joined = before.dataset.demonstrations + states
+            whole = replace(new, dataset=replace(before.dataset, demonstrations=joined))
+            old = before.dataset.answers
+        if self.run.probes is None:
+            return whole
+        around = Lesson.of(whole, self.student_obs, lesson)
+        answers = self._answers(round_, states.observations, around)
+        answers = answers if old is None else old + answers
+        return replace(
+            whole, dataset=replace(whole.dataset, probes=self.asking.source, answers=answers)
         )
-        if round_ == 0:  # every trainer's expert acts alone there
-            check_episodes(recorded, pool.name)
-        new = label(recorded, state.expert, state.episodes, round_)
-        state.count(recorded)
-        return Dataset(new, None, None, pool.boxes.low, pool.boxes.high, pool.name)
 
-    def _probe(self, observations: np.ndarray, round_: int, old: Answers | None) -> None:
-        """Ask the probes around states, and join the answers to those of earlier rounds."""
-        state = self.state
-        with self.training.stages.stage("probes", len(observations), "state") as move:
-            answers = state.ask_collected(observations, round_, move)
-        answers = old + answers if old is not None else answers
-        state.dataset = replace(state.data, probes=state.source, answers=answers)
+    def _answers(self, round_: int, observations: np.ndarray, lesson: Lesson) -> Answers:
+        """Ask the probes around a round's states; the answers are kept on the way."""
+        known = self.checkpoints.take_up(round_, ASKED)
+        self.asking.calibrate(lesson.dataset.demonstrations.observations, lesson.scales)
+        with self.progress.bar("probes", "state", len(observations)) as bar:
 
-    def _behaviour(self, pool: EnvironmentPool, round_: int) -> Behaviour:
-        """Return who acts in a round, which may take a few more episodes to find out."""
-        state, trainer = self.state, self.state.run.trainer
-        assert state.expert is not None
-        assert trainer is not None
+            def told(values: np.ndarray, states: int) -> None:
+                bar.move(states)
+                if self.checkpoints.due:
+                    self.checkpoints.keep(round_, ASKED, lambda: values, len(values))
 
-        def record_extra(behaviour: Behaviour, extra: int) -> Episodes:
-            return self._record(pool, behaviour, f"extra {round_}", 0, extra)
-
-        policy = state.view.policy(state.student.act) if state.student else None
-        return trainer.behaviour(Situation(round_, state.expert, policy, record_extra))
-
-    def _record(
-        self, pool: EnvironmentPool, behaviour: Behaviour, stream: str, first: int, count: int
-    ) -> Episodes:
-        run, numbers = self.state.run, range(first, first + count)
-        noise = [generator(run.seed, f"{stream} noise", episode) for episode in numbers]
-        seeds = episode_seeds(run.seed, stream, first, count)
-        total = count * run.horizon
-        with self.training.stages.stage("demonstrations", total, "step") as move:
-            return rollout(behaviour, pool, seeds, run.horizon, noise, move)
+            beginning = Beginning(known, told)
+            return self.asking.ask(observations, lesson.scales, round_, 0, beginning=beginning)

@@ -12,7 +12,7 @@ from typing import IO, Any
 from fdtasil.errors import FdtasilError, FitError
 from fdtasil.experts.worker_process import connect, receive, send
 from fdtasil.results.evaluation import Evaluation
-from fdtasil.run.pipeline import distill
+from fdtasil.shell.call import distil
 from fdtasil.shell.command import import_module_of
 
 __all__ = ["evaluated_beside"]
@@ -32,7 +32,7 @@ def evaluated_beside(
     The process ends with the block at the latest, and with this one whatever ends it.
 
     Args:
-        arguments: Of `distill`, fit to be pickled; None to do nothing.
+        arguments: Of the shell's `distil`; None to do nothing.
 
     Yields:
         What waits for the evaluation and returns it, or raises what the distillation raised.
@@ -79,7 +79,7 @@ def _main() -> None:
     try:
         with warnings.catch_warnings(action="ignore"):  # the run beside it warns of the same
             import_module_of(arguments["env"])
-            outcome = distill(**arguments, progress=False).evaluation
+            outcome = distil(arguments, progress=False).evaluation
     except FdtasilError as error:
         outcome = error
     send(replies, outcome)

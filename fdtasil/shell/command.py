@@ -1,11 +1,14 @@
-"""A function of the library as a command: its signature and docstring, as a shell can say them."""
+"""Functions of the library as commands: signatures and docstrings, as a shell can say them."""
 
 import importlib
 import inspect
 import os
+import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
+from dataclasses import dataclass, field
+from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Union, get_args, get_origin
 
@@ -15,6 +18,7 @@ __all__ = [
     "AgentPath",
     "EnvironmentId",
     "ExpertPath",
+    "Flags",
     "OptionalEnvironment",
     "OptionalExpert",
     "OptionalText",
@@ -31,62 +35,89 @@ AgentPath = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="AGENT.zi
 ExpertPath = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="EXPERT")]
 EnvironmentId = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ENV")]
 
-# Bars are silent by themselves where there is no terminal; a function has no name in a shell.
-_ONLY_PYTHON = ("progress", "callback")
-_METAVARS: dict[Any, str] = {tuple: "INT [INT ...]", int: "INT", float: "FLOAT"}
+_METAVARS: dict[Any, str] = {tuple: "INT [INT ...]", int: "INT", float: "FLOAT", Path: "PATH"}
+
+
+@dataclass(frozen=True)
+class Flags:
+    """Arguments of a command that a function, or a dataclass, of the library has.
+
+    Attributes:
+        owner: Whose signature and docstring are read.
+        only: Names of the arguments that are taken; None for all of them.
+        without: Names of those that are not.
+        types: Types of those that a shell can't express as the owner takes them.
+        open: Whether each may be left out, whatever its default: then it is None.
+    """
+
+    owner: Callable[..., Any]
+    only: tuple[str, ...] | None = None
+    without: tuple[str, ...] = ()
+    types: Mapping[str, Any] = field(default_factory=dict)
+    open: bool = False
+
+    def parameters(self) -> list[inspect.Parameter]:
+        """Return the arguments as a shell has them."""
+        found = inspect.signature(self.owner).parameters.values()
+        return [self._parameter(one) for one in found if self._taken(one.name)]
+
+    def texts(self) -> dict[str, str]:
+        """Return the help text of each argument, by name."""
+        rest = re.split(r"\n(?:Args|Attributes):\n", inspect.getdoc(self.owner) or "", maxsplit=1)
+        lines = inspect.cleandoc(rest[-1].partition("\n\n")[0]).splitlines()
+        texts: dict[str, str] = {}
+        name = ""
+        for line in lines:
+            if not line.startswith(" "):
+                name, _, line = line.partition(": ")
+            texts[name] = f"{texts.get(name, '')} {line.strip()}".strip()
+        return {name: text for name, text in texts.items() if self._taken(name)}
+
+    def _taken(self, name: str) -> bool:
+        return (self.only is None or name in self.only) and name not in self.without
+
+    def _parameter(self, parameter: inspect.Parameter) -> inspect.Parameter:
+        name, kind, default = parameter.name, parameter.annotation, parameter.default
+        kind = self.types.get(name, kind)
+        if self.open:
+            kind, default = kind | None, None
+        if get_origin(kind) in (Union, UnionType) and NoneType in get_args(kind):
+            # tyro would show "{None}|INT"; leaving the argument out is how a shell says None.
+            inner = next(one for one in get_args(kind) if one is not NoneType)
+            metavar = _METAVARS.get(get_origin(inner) or inner, "TEXT")
+            kind = Annotated[kind, tyro.conf.arg(metavar=metavar)]
+        keyword = inspect.Parameter.KEYWORD_ONLY
+        return parameter.replace(annotation=kind, default=default, kind=keyword)
 
 
 def as_command(
-    function: Callable[..., Any],
     run: Callable[..., None],
-    shell_types: dict[str, Any],
-    added: dict[str, tuple[Any, Any, str]],
+    flags: Sequence[Flags],
+    added: Mapping[str, tuple[Any, Any, str]],
 ) -> Callable[..., None]:
-    """Return `run` as a command with the arguments, defaults and help texts of `function`.
+    """Return `run` as a command: arguments, defaults and help texts are read from the library.
 
     Args:
-        function: Whose signature and docstring are read.
         run: Called with the parsed arguments.
-        shell_types: Types of those arguments that a shell can't express as `function` takes
-            them, by name.
+        flags: Where the arguments are read from; what the command does is said by the first.
         added: Type, default and help text of arguments that only the command has.
     """
 
     def command(**arguments: Any) -> None:
         run(**arguments)
 
-    parameters = [
-        _shell_parameter(parameter, shell_types)
-        for name, parameter in inspect.signature(function).parameters.items()
-        if name not in _ONLY_PYTHON
-    ]
-    parameters = [parameter for parameter in parameters if parameter.name not in added]
-    for name, (kind, default, _) in added.items():
-        parameters.append(
-            inspect.Parameter(
-                name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=kind
-            )
-        )
+    parameters = [parameter for one in flags for parameter in one.parameters()]
+    texts = {name: text for one in flags for name, text in one.texts().items()}
+    for name, (kind, default, text) in added.items():
+        keyword = inspect.Parameter.KEYWORD_ONLY
+        parameters.append(inspect.Parameter(name, keyword, default=default, annotation=kind))
+        texts[name] = text
     command.__dict__["__signature__"] = inspect.Signature(parameters)
     command.__annotations__ = {p.name: p.annotation for p in parameters}
-    head, _, rest = (inspect.getdoc(function) or "").partition("Args:\n")
-    texts = [rest.partition("\n\n")[0]]
-    texts += [f"    {name}: {text}" for name, (_, _, text) in added.items()]
-    command.__doc__ = f"{head}Args:\n" + "\n".join(texts)
+    head = (inspect.getdoc(flags[0].owner) or "").partition("Args:\n")[0]
+    lines = [f"    {name}: {text}" for name, text in texts.items()]
+    command.__doc__ = f"{head}Args:\n" + "\n".join(lines)
     return command
-
-
-def _shell_parameter(
-    parameter: inspect.Parameter, shell_types: dict[str, Any]
-) -> inspect.Parameter:
-    kind = shell_types.get(parameter.name, parameter.annotation)
-    default = str(parameter.default) if parameter.name == "probes" else parameter.default
-    if get_origin(kind) in (Union, UnionType) and NoneType in get_args(kind):
-        # tyro would show "{None}|INT"; leaving the argument out is how a shell says None.
-        inner = next(one for one in get_args(kind) if one is not NoneType)
-        metavar = _METAVARS.get(get_origin(inner) or inner, "TEXT")
-        kind = Annotated[kind, tyro.conf.arg(metavar=metavar)]
-    return parameter.replace(annotation=kind, default=default, kind=inspect.Parameter.KEYWORD_ONLY)
 
 
 def import_module_of(environment: str | None) -> None:

@@ -1,33 +1,32 @@
-"""What an expert is, before anything is learnt from it: `fdtasil inspect`."""
+"""`fdtasil inspect`: what an expert is, before anything is learnt from it."""
 
 from pathlib import Path
+from typing import Literal
 
 from fdtasil.checks import check_count
-from fdtasil.experts.gate import examine_expert
-from fdtasil.experts.load import load_expert
+from fdtasil.experts.examination import Looked, look_closely
 from fdtasil.files.storage import write_bytes
-from fdtasil.probes.calibration import calibrate
+from fdtasil.probes.calibration import Calibration, calibrate
 from fdtasil.probes.scales import measure_scales
 from fdtasil.results.figures import draw_calibration
-from fdtasil.rollouts.behaviours import follow, random_behaviour
-from fdtasil.rollouts.environments import EnvironmentPool, resolve_horizon
-from fdtasil.rollouts.rollout import rollout
+from fdtasil.rollouts.environments import EnvironmentPool
 from fdtasil.run.presets import PRESETS
-from fdtasil.seeding import episode_seeds, generator
+from fdtasil.seeding import generator
+from fdtasil.shell.call import opened
 from fdtasil.shell.command import EnvironmentId, ExpertPath, import_module_of
 
-__all__ = ["inspect_expert"]
+__all__ = ["command"]
 
-_STATES = 32
 _CHANCE = "  (no worse than the expert: does it belong to this environment and version?)"
 
 
-def inspect_expert(
+def command(
     expert: ExpertPath,
     env: EnvironmentId,
     /,
     *,
     output: str | None = None,
+    trust: Literal["pickle"] | None = None,
     episodes: int = 5,
     horizon: int | None = None,
     seed: int = 0,
@@ -39,6 +38,8 @@ def inspect_expert(
         expert: ONNX file, zip of a stable-baselines3 agent, or address.
         env: Gymnasium id (module:Id imports the module first).
         output: Name of the ONNX output with the actions.
+        trust: "pickle" lets stable-baselines3 load what can't be read from a zip without running
+            code that is in it.
         episodes: Episodes that the return is measured over.
         horizon: Steps after which an episode is cut; default: the environment's time limit.
         seed: Of the episodes.
@@ -46,38 +47,60 @@ def inspect_expert(
     """
     check_count("episodes", episodes)
     import_module_of(env)
+    source = opened(expert, env, output=output, trust=trust)
+    assert source is not None
     with EnvironmentPool(env) as pool:
-        boxes, length = pool.boxes, resolve_horizon(horizon, pool)
-        opened = load_expert(expert, boxes.observation_size, boxes.action_size, output=output)
-        starts = episode_seeds(seed, "evaluation", 0, episodes)
-        recorded = rollout(follow(opened.policy("act")), pool, starts, length)
-        noise = [generator(seed, "random actions", episode) for episode in range(episodes)]
-        chance = rollout(random_behaviour(pool), pool, starts, length, noise).returns.mean()
-        visited = recorded.observations[recorded.valid]
-        findings = examine_expert(opened, recorded.spread(_STATES), boxes)
-        usual = PRESETS["standard"].radius
-        random = generator(seed, "calibration")
-        found = calibrate(opened, visited, measure_scales(visited), random, usual)
-    returns, falls = recorded.returns, int(recorded.terminated.sum())
-    rows = [
-        ("expert", expert),
-        ("sha256", opened.sha256),
-        ("environment", pool.name),
-        ("observations", boxes.observation_size),
-        ("actions", f"{boxes.action_size}, from {boxes.low.min():g} to {boxes.high.max():g}"),
-        ("analytic", "a torch twin agrees with it" if opened.module else "not available"),
-        *((f.name, f"{'FAILED: ' if f.problem else ''}{f.measured}") for f in findings),
-        ("regime", found.regime),
-        ("noise floor", f"{found.noise_floor:.1e} of the action, root mean square"),
-        ("suggested radius", f"{found.radius:.2g} standard deviations, {found.stencil} stencil"),
-        ("return", f"{returns.mean():.1f} +- {returns.std():.1f} over {episodes} episodes"),
-        ("random actions", f"{chance:.1f}{_CHANCE if returns.mean() <= chance else ''}"),
-        ("ended early", f"{falls} of {episodes}, of at most {length} steps"),
-    ]
+        looked = look_closely(source, pool, horizon, seed, episodes)
+        rows = [("expert", expert), ("environment", pool.name), *_contract(looked, pool)]
+    problem = next((finding.problem for finding in looked.findings if finding.problem), None)
+    found = _calibrated(looked, seed)
+    if found is not None:
+        rows += [
+            ("regime", found.regime),
+            ("noise floor", f"{found.noise_floor:.1e} of the action, root mean square"),
+            ("suggested radius", f"{found.radius:.2g} deviations, {found.stencil} stencil"),
+        ]
+    rows += _returns(looked)
     print("\n".join(f"{name:20}{value}" for name, value in rows))
-    if picture is not None:
+    if picture is not None and found is not None:
         write_bytes(picture, draw_calibration(found))
         print(f"{'picture':20}{picture}")
-    problem = next((finding.problem for finding in findings if finding.problem), None)
     if problem:
         raise problem
+
+
+def _contract(looked: Looked, pool: EnvironmentPool) -> list[tuple[str, object]]:
+    boxes, expert = pool.boxes, looked.expert
+    rows: list[tuple[str, object]] = [
+        ("observations", boxes.observation_size),
+        ("actions", f"{boxes.action_size}, from {boxes.low.min():g} to {boxes.high.max():g}"),
+    ]
+    if expert is not None:
+        rows.insert(0, ("sha256", expert.sha256))
+        rows += [("analytic", "a torch twin agrees with it" if expert.module else "not available")]
+    return rows + [
+        (finding.name, f"{'FAILED: ' if finding.problem else ''}{finding.measured}")
+        for finding in looked.findings
+        if finding.name != "opening" or finding.problem
+    ]
+
+
+def _calibrated(looked: Looked, seed: int) -> Calibration | None:
+    if looked.own is None or looked.expert is None:
+        return None
+    visited, random = looked.own.observations[looked.own.valid], generator(seed, "calibration")
+    scales, radius = measure_scales(visited), PRESETS["standard"].radius
+    return calibrate(looked.expert, visited, scales, random, radius)
+
+
+def _returns(looked: Looked) -> list[tuple[str, object]]:
+    if looked.own is None or looked.chance is None:
+        return []
+    returns, chance = looked.own.returns, looked.chance.returns.mean()
+    count, length = looked.own.valid.shape
+    falls = int(looked.own.terminated.sum())
+    return [
+        ("return", f"{returns.mean():.1f} +- {returns.std():.1f} over {count} episodes"),
+        ("random actions", f"{chance:.1f}{_CHANCE if returns.mean() <= chance else ''}"),
+        ("ended early", f"{falls} of {count}, of at most {length} steps"),
+    ]

@@ -9,7 +9,7 @@ from torch import Tensor
 from fdtasil.demonstrations.states import Demonstrations
 from fdtasil.probes.answers import Answers
 from fdtasil.probes.source import Probes
-from fdtasil.student.loss import Minibatch
+from fdtasil.student.loss import Minibatch, ProbeBatch
 
 __all__ = ["Batches"]
 
@@ -20,7 +20,7 @@ class Batches:
     Args:
         demonstrations: N labelled states.
         probes: The derivative source; None for plain behaviour cloning.
-        answers: Number of the pool -> the expert's answers; None without probes.
+        answers: Number of the sample -> the expert's answers; None without probes.
         random: Name of a stream -> its generator; an epoch's order depends on its number only.
         device: Where the data and the minibatches are.
     """
@@ -51,17 +51,11 @@ class Batches:
     def visit(self, rows: Tensor, number: int) -> Minibatch:
         """Return the minibatch of some states, given on the device, at their visit `number`."""
         seen, said = self._observations[rows], self._actions[rows]
-        if self._dealer is None:
-            return Minibatch(seen, said)
-        return Minibatch(seen, said, *self._dealer.deal(rows, number), self._dealer.gain)
+        return Minibatch(seen, said, self._dealer and self._dealer.deal(rows, number))
 
 
 class _Dealer:
-    """The expert's answers around each state; a visit of the state uses the next of them.
-
-    Attributes:
-        gain: Of the answers in use.
-    """
+    """The expert's answers around each state; a visit of the state uses the next of them."""
 
     def __init__(
         self,
@@ -77,22 +71,23 @@ class _Dealer:
         self._fill(0)
 
     def load(self, visit: int) -> None:
-        """Ask anew where a visit needs answers that the pool does not have."""
+        """Ask anew where a visit needs answers that the sample in use does not have."""
         if self._probes.resample:
-            pool = visit * self._used // self._numbers.shape[1]
-            if pool != self._number:
-                self._fill(pool)
+            number = visit * self._used // self._numbers.shape[1]
+            if number != self._number:
+                self._fill(number)
 
-    def deal(self, rows: Tensor, visit: int) -> tuple[Tensor, Tensor]:
-        """Return displacements (B, used, n) and values (B, used, p, m) of the states' visit."""
+    def deal(self, rows: Tensor, visit: int) -> ProbeBatch:
+        """Return the probes (B, used) of the states' visit."""
         turns = visit * self._used + torch.arange(self._used, device=self._device)
         columns = (self._offset[rows] + turns) % self._numbers.shape[1]
         rows = rows[:, None]
-        return self._bank[self._numbers[rows, columns]], self._values[rows, columns]
+        displacements = self._bank[self._numbers[rows, columns]]
+        return ProbeBatch(displacements, self._values[rows, columns], self._gain)
 
     def _fill(self, number: int) -> None:
         answers = self._ask(number)
-        self._number, self.gain = number, answers.gain
+        self._number, self._gain = number, answers.gain
         self._bank = torch.from_numpy(answers.displacements).to(self._device)
         self._numbers = torch.from_numpy(np.ascontiguousarray(answers.numbers)).to(self._device)
         self._values = torch.from_numpy(answers.values).to(self._device)

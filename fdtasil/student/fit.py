@@ -3,85 +3,88 @@
 import math
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from itertools import count, islice
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from fdtasil.checks import check_count, check_number, check_share
 from fdtasil.demonstrations.states import Demonstrations
 from fdtasil.errors import SettingError
 from fdtasil.probes.answers import Answers
 from fdtasil.probes.source import Probes
 from fdtasil.student.batches import Batches
 from fdtasil.student.fit_state import FitState
-from fdtasil.student.loss import Minibatch, Weights, taylor_loss
-from fdtasil.student.network import Student
+from fdtasil.student.loss import Minibatch, TaylorLoss, Weights, taylor_loss
+from fdtasil.student.policy import Student
 from fdtasil.student.step import gradient_step
 
 __all__ = ["Fit", "Hooks", "fit", "hold_out"]
 
+# Where nobody says a length: so many steps for so many states, and more for more.
+_USUAL_STEPS, _USUAL_STATES = 4000, 1500
 _LOG_EVERY = 100  # steps between two entries of the history; reading a loss waits for the device
 
 
 @dataclass(frozen=True)
 class Fit:
-    """How a student is optimised.
+    """How a student is optimised: length, AdamW, the terms of the Taylor loss, validation.
 
     Attributes:
-        steps: Gradient steps, or None to count epochs.
-        steps_for: States that `steps` are meant for: more states take more steps, by the square
-            root of their number, in whole hundreds. None takes `steps` whatever their number.
-        epochs: Visits of each state, or None to count steps; one of the two is set.
+        steps: Gradient steps of a round. Left out, 4,000, and beyond 1,500 states more, by the
+            square root of their number.
+        epochs: Visits of each state in a round, instead of steps.
         batch_size: States in a minibatch at most; an epoch's are of almost equal size.
-        learning_rate: Peak rate of AdamW, with cosine decay to zero.
+        learning_rate: Peak learning rate of AdamW, with cosine decay to zero.
         weight_decay: Decoupled weight decay.
         epsilon: AdamW's epsilon.
-        weight: lambda_1, the weight of the derivative error.
-        curvature_weight: lambda_2, the weight of the error of the second differences, in a loss
-            of second order.
-        max_gradient_norm: Longer gradients are scaled to this norm; None leaves them.
+        order: Of the Taylor loss: 1, or 2 to match second differences too (central stencil, or
+            "jacobian"). Without probes it is 0.
+        weight: lambda_1, the weight of the derivative error. 0.5 holds the student to the
+            expert's reaction to deviations of about half a standard deviation.
+        curvature_weight: lambda_2, the weight of the error of the second differences, with order
+            2.
+        max_gradient_norm: Scale longer gradients to this norm; left out, they stay.
         validation: Share of the episodes held out, by which the best weights are chosen; 0 keeps
             the last weights. A round with a single episode holds none out.
-        patience: Validations (one each 100 steps) without a better one after which training
-            stops; None goes on to the end.
+        patience: Validations (one each 100 steps) without a better one after which to stop; left
+            out, training goes on to the end.
+
+    Raises:
+        SettingError: If a value can't be used, or two of them don't go together.
+
+    Example:
+        >>> Fit(epochs=10).total_steps(states=1500), Fit().total_steps(states=6000)
+        (150, 8000)
     """
 
-    steps: int | None
-    steps_for: int | None
-    epochs: int | None
-    batch_size: int
-    learning_rate: float
-    weight_decay: float
-    epsilon: float
-    weight: float
-    curvature_weight: float
-    max_gradient_norm: float | None
-    validation: float
-    patience: int | None
+    steps: int | None = None
+    epochs: int | None = None
+    batch_size: int = 100
+    learning_rate: float = 1e-3
+    weight_decay: float = 0.01
+    epsilon: float = 1e-8
+    order: int = 1
+    weight: float = 0.5
+    curvature_weight: float = 0.125
+    max_gradient_norm: float | None = None
+    validation: float = 0.0
+    patience: int | None = None
 
     def __post_init__(self) -> None:
-        if (self.steps is None) == (self.epochs is None):
+        for name in ("steps", "epochs", "batch_size", "order", "patience"):
+            self._check(name, check_count)
+        for name in ("learning_rate", "weight_decay", "epsilon", "weight", "curvature_weight"):
+            self._check(name, check_number)
+        self._check("max_gradient_norm", partial(check_number, positive=True))
+        self._check("validation", partial(check_share, whole=False))
+        if self.order > 2:
+            raise SettingError(f"order={self.order}", "1 or 2", "write order=1; probes=0 is 0")
+        if self.steps is not None and self.epochs is not None:
             found = f"steps={self.steps}, epochs={self.epochs}"
             raise SettingError(found, "one of the two", "leave one out")
-        if self.steps is None and self.steps_for is not None:
-            found = f"steps_for={self.steps_for} without steps"
-            raise SettingError(found, "steps that grow", "leave it out, or give steps")
-        for name in ("steps", "steps_for", "epochs", "batch_size", "patience"):
-            value = getattr(self, name)
-            whole = isinstance(value, int) and not isinstance(value, bool) and value > 0
-            if value is not None and not whole:
-                raise SettingError(f"{name}={value!r}", "a positive integer", f"write {name}=100")
-        for name in ("learning_rate", "weight_decay", "epsilon", "weight", "curvature_weight"):
-            value = getattr(self, name)
-            if not 0 <= value < math.inf:
-                raise SettingError(f"{name}={value!r}", "a number of at least 0", "raise it")
-        if self.max_gradient_norm is not None and not 0 < self.max_gradient_norm < math.inf:
-            found = f"max_gradient_norm={self.max_gradient_norm!r}"
-            raise SettingError(found, "a positive number", "write for example 1.0")
-        if not 0 <= self.validation < 1:
-            found = f"validation={self.validation!r}"
-            raise SettingError(found, "a share from 0 to below 1", "write for example 0.2")
         if self.patience is not None and self.validation == 0:
             raise SettingError(
                 f"patience={self.patience} without validation",
@@ -89,17 +92,25 @@ class Fit:
                 "write for example validation=0.2",
             )
 
+    def _check(self, name: str, check: Callable[[str, object], float]) -> None:
+        """Refuse a field that can't be used, and keep the others as plain numbers of Python."""
+        value = getattr(self, name)
+        if value is not None or Fit.__dataclass_fields__[name].default is not None:
+            object.__setattr__(self, name, check(name, value))
+
     def steps_an_epoch(self, states: int) -> int:
         """Return the minibatches that visit each of `states` states once."""
         return max(1, -(-states // self.batch_size))
 
     def total_steps(self, states: int) -> int:
         """Return the gradient steps of a training on `states` states."""
-        if self.steps is None:
-            return (self.epochs or 0) * self.steps_an_epoch(states)
-        if self.steps_for is None or states <= self.steps_for:
+        if self.epochs is not None:
+            return self.epochs * self.steps_an_epoch(states)
+        if self.steps is not None:
             return self.steps
-        grown = self.steps * (states / self.steps_for) ** 0.5
+        if states <= _USUAL_STATES:
+            return _USUAL_STEPS
+        grown = _USUAL_STEPS * (states / _USUAL_STATES) ** 0.5
         return _LOG_EVERY * round(grown / _LOG_EVERY)  # a last entry of a few steps tells little
 
     def held_out(self, episodes: int) -> int:
@@ -118,10 +129,12 @@ class Hooks:
     """Who is told of a training's progress.
 
     Attributes:
+        begin: Told the number of steps before the first one.
         entry: Told each new entry of the history.
         checkpoint: Told the state at the end of each epoch; must not keep it.
     """
 
+    begin: Callable[[int], None] = field(default=lambda steps: None)
     entry: Callable[[dict[str, float]], None] = field(default=lambda entry: None)
     checkpoint: Callable[[FitState], None] = field(default=lambda state: None)
 
@@ -134,7 +147,6 @@ def fit(
     settings: Fit,
     random: Callable[[str], torch.Generator],
     *,
-    order: int = 1,
     hooks: Hooks | None = None,
     resume: bytes | None = None,
 ) -> list[dict[str, float]]:
@@ -147,11 +159,10 @@ def fit(
         student: Changed in place.
         demonstrations: N labelled states.
         probes: The derivative source; None for plain behaviour cloning.
-        answers: Number of the pool -> the expert's answers; asked for pool 0, and for the next
-            one when the answers are used up, if the source resamples. None without probes.
-        settings: How.
+        answers: Number of the sample -> the expert's answers; asked for sample 0, and for the
+            next one when the answers are used up, if the source resamples. None without probes.
+        settings: How; the order is that of the answers.
         random: Name of a stream -> its generator.
-        order: 1, or 2 to match second differences too.
         hooks: Who is told of progress.
         resume: The bytes of a state given to `hooks.checkpoint` by an earlier call with the same
             arguments; the result is the same as without the interruption, to the byte.
@@ -170,6 +181,7 @@ def fit(
     training, held_out = hold_out(demonstrations, settings, random("held out"))
     per_epoch = settings.steps_an_epoch(len(training))
     steps = settings.total_steps(len(training))
+    told.begin(steps)
     optimiser = torch.optim.AdamW(
         student.parameters(),
         lr=settings.learning_rate,
@@ -178,18 +190,17 @@ def fit(
         fused=True,
         capturable=device.type == "cuda",
     )
-    weights = Weights(settings.weight, settings.curvature_weight if order == 2 else None)
+    weights = Weights(settings.weight, settings.curvature_weight if settings.order == 2 else None)
     stencil = probes.stencil if probes else None
-    # Taken once, of the first pool: two validations then differ by the student alone.
+    # Taken once, of the first sample: two validations then differ by the student alone.
     parts = held_out.to(device).split(settings.batch_size)
     judges = [batches.visit(part, 0) for part in parts if len(part)]
     state = FitState(student, optimiser)
     if resume is not None:
         state.restore(resume)
 
-    def loss_of(batch: Minibatch) -> Tensor:
-        loss = taylor_loss(student, batch, stencil, weights)
-        return torch.stack([loss.total, loss.action, loss.derivative, loss.curvature])
+    def loss_of(batch: Minibatch) -> TaylorLoss:
+        return taylor_loss(student, batch, stencil, weights)
 
     step = gradient_step(student, optimiser, loss_of, settings.max_gradient_norm, device)
     first_epoch = state.step // per_epoch
@@ -215,13 +226,13 @@ def _deal(batches: Batches, rows: Tensor, per_epoch: int, first_epoch: int) -> I
 
 
 def _held_out_loss(
-    loss_of: Callable[[Minibatch], Tensor], judges: Sequence[Minibatch]
+    loss_of: Callable[[Minibatch], TaylorLoss], judges: Sequence[Minibatch]
 ) -> float | None:
     """Return the mean loss of all held-out rows, or None where there are none."""
     if not judges:
         return None
     rows = [len(batch.actions) for batch in judges]
-    losses = [float(loss_of(batch)[0].detach()) for batch in judges]
+    losses = [float(loss_of(batch).loss.detach()) for batch in judges]
     return sum(n * loss for n, loss in zip(rows, losses, strict=True)) / sum(rows)
 
 

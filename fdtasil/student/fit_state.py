@@ -1,17 +1,17 @@
 """Where a training stands: what it needs to go on with the same bytes."""
 
-import json
 import math
 
-import safetensors.torch
 import torch
 from torch import Tensor, nn
 
-from fdtasil.errors import FitError, StorageError
+from fdtasil.errors import FitError, StorageError, first_line
+from fdtasil.files.tensors import tensors_from_bytes, tensors_to_bytes
+from fdtasil.student.loss import TaylorLoss
 
 __all__ = ["FitState"]
 
-_TERMS = ("loss", "action_error", "derivative_error", "curvature_error")
+_ENTRY = "fit"
 
 
 class FitState:
@@ -37,7 +37,7 @@ class FitState:
         self._best: dict[str, Tensor] = {}
 
     def count(self, losses: Tensor) -> None:
-        """Count one step and its (4,) losses."""
+        """Count one step, with the (4,) numbers of its `TaylorLoss`."""
         self.step += 1
         self._recent.append(losses)
 
@@ -82,7 +82,10 @@ class FitState:
         self.check_finite(held_out)
         means = torch.stack(self._recent).mean(dim=0).tolist()
         self._recent = []
-        entry: dict[str, float] = {"step": self.step, **dict(zip(_TERMS, means, strict=True))}
+        entry: dict[str, float] = {
+            "step": self.step,
+            **dict(zip(TaylorLoss._fields, means, strict=True)),
+        }
         entry["validation_loss"] = entry["loss"] if held_out is None else held_out
         if held_out is not None:
             self.stale += 1
@@ -112,7 +115,7 @@ class FitState:
         for number, moments in self._optimiser.state_dict()["state"].items():
             groups[f"optimiser.{number}"] = moments
         tensors = {
-            f"{group}/{name}": tensor.detach().cpu().contiguous().clone()
+            f"{group}/{name}": tensor.detach().clone()
             for group, members in groups.items()
             for name, tensor in members.items()
         }
@@ -122,7 +125,7 @@ class FitState:
             "best_loss": None if math.isinf(self._best_loss) else self._best_loss,
             "history": self.history,
         }
-        return safetensors.torch.save(tensors, {"fit": json.dumps(numbers)})
+        return tensors_to_bytes(tensors, numbers, _ENTRY)
 
     def restore(self, data: bytes) -> None:
         """Take over the state that `to_bytes` wrote.
@@ -130,15 +133,13 @@ class FitState:
         Raises:
             StorageError: If it is not such a state, or of another student.
         """
+        tensors, numbers = tensors_from_bytes(data, _ENTRY, "the state of a training")
         try:
-            tensors = safetensors.torch.load(data)
-            size = int.from_bytes(data[:8], "little")
-            numbers = json.loads(json.loads(data[8 : 8 + size])["__metadata__"]["fit"])
             self._student.load_state_dict(_group(tensors, "student"))
             self._load_moments(tensors)
-        except (safetensors.SafetensorError, KeyError, ValueError, RuntimeError) as error:
+        except (KeyError, ValueError, RuntimeError) as error:
             raise StorageError(
-                f"not the state of this training: {error}".splitlines()[0],
+                f"not the state of this training: {first_line(error)}",
                 "a checkpoint of the same run",
                 "start the run anew in another folder",
             ) from error

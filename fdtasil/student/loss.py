@@ -1,13 +1,30 @@
 """The Taylor loss: match the expert's actions, and its differences along the probes."""
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
 from fdtasil.probes.stencils import Stencil
 
-__all__ = ["Minibatch", "TaylorLoss", "Weights", "taylor_loss"]
+__all__ = ["Minibatch", "ProbeBatch", "TaylorLoss", "Weights", "taylor_loss"]
+
+
+@dataclass(frozen=True)
+class ProbeBatch:
+    """What the expert said around the states of a training step.
+
+    Attributes:
+        displacements: (B, k, n) where each state is probed.
+        values: (B, k, p, m) what the expert said there; see `Answers`.
+        gain: From `Answers`, so that the weights mean the same for every design, number of
+            probes and radius.
+    """
+
+    displacements: Tensor
+    values: Tensor
+    gain: float
 
 
 @dataclass(frozen=True)
@@ -17,17 +34,12 @@ class Minibatch:
     Attributes:
         observations: (B, n).
         actions: (B, m) expert actions.
-        displacements: (B, k, n) where each state is probed, or None without probes.
-        values: (B, k, p, m) what the expert said there, or None; see `Answers`.
-        gain: From `Answers`, so that the weights mean the same for every design, number of
-            probes and radius.
+        probes: What it said around them; None for plain behaviour cloning.
     """
 
     observations: Tensor
     actions: Tensor
-    displacements: Tensor | None = None
-    values: Tensor | None = None
-    gain: float = 1.0
+    probes: ProbeBatch | None = None
 
 
 @dataclass(frozen=True)
@@ -43,23 +55,22 @@ class Weights:
     curvature: float | None = None
 
 
-@dataclass(frozen=True)
-class TaylorLoss:
-    """The loss of a minibatch and its parts.
+class TaylorLoss(NamedTuple):
+    """The loss of a minibatch and its parts, by the names that a history has them under.
 
     Attributes:
-        total: (), what is minimised.
-        action: (), mean norm of the action error.
-        derivative: (), mean norm of the error of the first differences, in units of the whitened
-            Jacobian's Frobenius norm; 0 without probes.
-        curvature: (), mean norm of the error of the second differences, in units of z'Hz for
-            standard normal z in whitened coordinates; 0 in a loss of first order.
+        loss: (), what is minimised.
+        action_error: (), mean norm of the action error.
+        derivative_error: (), mean norm of the error of the first differences, in units of the
+            whitened Jacobian's Frobenius norm; 0 without probes.
+        curvature_error: (), mean norm of the error of the second differences, in units of z'Hz
+            for standard normal z in whitened coordinates; 0 in a loss of first order.
     """
 
-    total: Tensor
-    action: Tensor
-    derivative: Tensor
-    curvature: Tensor
+    loss: Tensor
+    action_error: Tensor
+    derivative_error: Tensor
+    curvature_error: Tensor
 
 
 def taylor_loss(
@@ -79,39 +90,33 @@ def taylor_loss(
 
     Example:
         >>> batch = Minibatch(torch.zeros(2, 3), torch.ones(2, 3))
-        >>> taylor_loss(nn.Identity(), batch, None, Weights(0.0)).total
+        >>> taylor_loss(nn.Identity(), batch, None, Weights(0.0)).loss
         tensor(1.7321)
     """
-    if stencil is None or batch.displacements is None or batch.values is None:
+    probes = batch.probes
+    if stencil is None or probes is None:
         action = _mean_norm(student(batch.observations) - batch.actions)
         zero = torch.zeros_like(action)
         return TaylorLoss(action, action, zero, zero)
-    second = weights.curvature is not None
     errors = _exact_errors if stencil.exact else _difference_errors
-    found = errors(student, batch, batch.displacements, batch.values, stencil, second=second)
-    probes = batch.displacements.shape[1]
+    found = errors(student, batch, probes, stencil, second=weights.curvature is not None)
+    count = probes.displacements.shape[1]
     action = _mean_norm(found[0])
-    derivative = batch.gain / probes**0.5 * _mean_norm(found[1].flatten(1))
+    derivative = probes.gain / count**0.5 * _mean_norm(found[1].flatten(1))
     total, curvature = action + weights.derivative * derivative, torch.zeros_like(action)
     if weights.curvature is not None:
-        curvature = batch.gain**2 / probes**0.5 * _mean_norm(found[2].flatten(1))
+        curvature = probes.gain**2 / count**0.5 * _mean_norm(found[2].flatten(1))
         total = total + weights.curvature * curvature
     return TaylorLoss(total, action, derivative, curvature)
 
 
 def _difference_errors(
-    student: nn.Module,
-    batch: Minibatch,
-    displacements: Tensor,
-    values: Tensor,
-    stencil: Stencil,
-    *,
-    second: bool,
+    student: nn.Module, batch: Minibatch, probes: ProbeBatch, stencil: Stencil, *, second: bool
 ) -> tuple[Tensor, ...]:
     """Return the errors (B, m) at the states, and (B, k, m) of the first (and second) ones."""
-    rows, n = batch.observations.shape
+    (rows, n), values = batch.observations.shape, probes.values
     # Numbers, not tensors of them: a tensor would wait for the GPU at every step.
-    moved = torch.stack([offset * displacements for offset in stencil.offsets], dim=2)
+    moved = torch.stack([offset * probes.displacements for offset in stencil.offsets], dim=2)
     points = batch.observations[:, None, None, :] + moved
     # One forward pass over all points: a stencil must see one and the same function.
     answers = student(torch.cat([batch.observations, points.reshape(-1, n)]))
@@ -133,19 +138,13 @@ def _difference_errors(
 
 
 def _exact_errors(
-    student: nn.Module,
-    batch: Minibatch,
-    displacements: Tensor,
-    values: Tensor,
-    stencil: Stencil,
-    *,
-    second: bool,
+    student: nn.Module, batch: Minibatch, probes: ProbeBatch, stencil: Stencil, *, second: bool
 ) -> tuple[Tensor, ...]:
     """Return the errors (B, m) at the states, and (B, k, m) of the exact derivatives."""
-    count = displacements.shape[1]
+    (_, count, _), values = probes.displacements.shape, probes.values
     states = batch.observations.repeat_interleave(count, dim=0)
     along = _second_derivative_along if second else _derivative_along
-    answers, *derivatives = along(student, states, displacements.flatten(0, 1))
+    answers, *derivatives = along(student, states, probes.displacements.flatten(0, 1))
     action_error = answers[::count] - batch.actions
     errors = [
         derivative.reshape(values[:, :, 0].shape) - values[:, :, order]

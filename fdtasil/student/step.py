@@ -1,17 +1,17 @@
 """One gradient step; on a GPU its kernels are recorded once and launched together."""
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
-from fdtasil.student.loss import Minibatch
+from fdtasil.student.loss import Minibatch, ProbeBatch, TaylorLoss
 
-__all__ = ["Step", "gradient_step"]
+__all__ = ["Step", "copy_of", "gradient_step", "tensors_of"]
 
 Step = Callable[[Minibatch, float], Tensor]
-"""Takes a step on a minibatch at a learning rate, and returns its losses."""
+"""Takes a step on a minibatch at a learning rate, and returns its loss and parts as (4,)."""
 
 # Steps before the first recording, on its stream: AdamW's moments and cuBLAS's workspace must be
 # there, for what is made while recording belongs to that one recording.
@@ -21,7 +21,7 @@ _EAGER = 3
 def gradient_step(
     student: nn.Module,
     optimiser: torch.optim.Optimizer,
-    loss_of: Callable[[Minibatch], Tensor],
+    loss_of: Callable[[Minibatch], TaylorLoss],
     max_gradient_norm: float | None,
     device: torch.device,
 ) -> Step:
@@ -30,14 +30,14 @@ def gradient_step(
     Args:
         student: Whose weights are changed.
         optimiser: Of these weights, "capturable" on a GPU.
-        loss_of: Minibatch -> (4,) losses, of which the first is minimised.
+        loss_of: What is minimised, and its parts.
         max_gradient_norm: Longer gradients are scaled to this norm; None leaves them.
         device: Where student and minibatches are.
     """
 
     def step(batch: Minibatch, rate: float | Tensor) -> Tensor:
         optimiser.param_groups[0]["lr"] = rate
-        losses = loss_of(batch)
+        losses = torch.stack(loss_of(batch))
         optimiser.zero_grad(set_to_none=True)
         losses[0].backward()
         if max_gradient_norm is not None:
@@ -78,13 +78,12 @@ class _Replayed:
         if self._eager:
             self._eager -= 1
             return self._aside(batch)
-        key = batch.gain, *((name, tensor.shape) for name, tensor in _tensors(batch).items())
+        key = batch.probes and batch.probes.gain, *(tensor.shape for tensor in tensors_of(batch))
         if key not in self._recordings:
             self._recordings[key] = self._record(batch)
         recording = self._recordings[key]
-        inputs = _tensors(recording.batch)
-        for name, tensor in _tensors(batch).items():
-            inputs[name].copy_(tensor)
+        for theirs, tensor in zip(tensors_of(recording.batch), tensors_of(batch), strict=True):
+            theirs.copy_(tensor)
         recording.graph.replay()
         return recording.losses.clone()
 
@@ -98,13 +97,24 @@ class _Replayed:
         return losses
 
     def _record(self, batch: Minibatch) -> _Recording:
-        copies = {name: tensor.clone() for name, tensor in _tensors(batch).items()}
-        inputs, graph = replace(batch, **copies), torch.cuda.CUDAGraph()
+        inputs, graph = copy_of(batch), torch.cuda.CUDAGraph()
         # What other threads of the caller do with the GPU meanwhile is none of the recording's.
         with torch.cuda.graph(graph, stream=self._stream, capture_error_mode="thread_local"):
             losses = self._step(inputs, self._rate)
         return _Recording(graph, inputs, losses)
 
 
-def _tensors(batch: Minibatch) -> dict[str, Tensor]:
-    return {name: value for name, value in vars(batch).items() if isinstance(value, Tensor)}
+def tensors_of(batch: Minibatch) -> tuple[Tensor, ...]:
+    """Return all tensors of a minibatch, in an order that its kind alone decides."""
+    probes = batch.probes
+    around = () if probes is None else (probes.displacements, probes.values)
+    return batch.observations, batch.actions, *around
+
+
+def copy_of(batch: Minibatch) -> Minibatch:
+    """Return a minibatch with tensors of its own."""
+    probes = batch.probes
+    if probes is not None:
+        values = probes.values.clone()
+        probes = ProbeBatch(probes.displacements.clone(), values, probes.gain)
+    return Minibatch(batch.observations.clone(), batch.actions.clone(), probes)

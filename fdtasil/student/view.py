@@ -3,25 +3,18 @@
 import operator
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from pathlib import Path
 
 import numpy as np
 
 from fdtasil.demonstrations.states import Demonstrations
-from fdtasil.errors import ExpertError, SettingError, shown
-from fdtasil.experts.hub import fetch
-from fdtasil.experts.hub.place import is_hub_uri
-from fdtasil.files.onnx.model import read_model
+from fdtasil.errors import SettingError
 from fdtasil.probes.answers import Answers
 from fdtasil.rollouts.behaviours import Policy
 
-__all__ = ["COLUMNS", "StudentObservation", "View", "columns_of", "describe_view"]
+__all__ = ["StudentObservation", "View", "describe_view"]
 
 StudentObservation = Sequence[int] | Callable[[np.ndarray], np.ndarray]
 """Indices of the coordinates that the student sees, or (B, n) -> (B, k)."""
-
-COLUMNS = "fdtasil.observation_columns"
-"""Metadata entry of an exported student that sees some coordinates only."""
 
 _SAME = 1e-4  # relative; beyond the rounding of float32, below any nonlinearity worth the name
 
@@ -108,24 +101,6 @@ class View:
         points = states[:, None, :] + moved
         seen = self.look(points.reshape(-1, points.shape[-1]))
         return seen.reshape(*points.shape[:2], -1) - centres[:, None, :]
-
-
-def columns_of(policy: object) -> tuple[int, ...] | None:
-    """Return the columns that an exported student's file says it sees, or None."""
-    path = fetch(policy).path if is_hub_uri(policy) else policy
-    if not isinstance(path, (str, Path)) or Path(path).suffix != ".onnx":
-        return None
-    model, _ = read_model(Path(path))
-    texts = {entry.key: entry.value for entry in model.metadata_props}
-    columns = texts.get(COLUMNS)
-    try:
-        return None if columns is None else tuple(int(column) for column in columns.split(","))
-    except (TypeError, ValueError) as error:
-        raise ExpertError(
-            f"{path} says that it sees the columns {shown(columns)}",
-            "numbers with commas between, as fdtasil writes them",
-            "export the student again, or pass student_obs=",
-        ) from error
 
 
 def describe_view(student_obs: StudentObservation | None) -> tuple[int, ...] | str | None:

@@ -9,9 +9,10 @@ from collections.abc import Callable
 from dataclasses import replace
 
 from fdtasil.errors import ExpertError, SettingError
-from fdtasil.experts.expert import Answer, Expert
+from fdtasil.experts.expert import Expert
 from fdtasil.experts.workers.handle import WorkerProcess
 from fdtasil.experts.workers.pool import WorkerPool
+from fdtasil.rollouts.behaviours import Policy
 
 __all__ = ["check_workers", "with_processes", "with_threads"]
 
@@ -57,7 +58,7 @@ def with_threads(expert: Expert, workers: int) -> Expert:
 
 
 def with_processes(
-    expert: Expert, opener: Callable[[], Answer] | None, workers: int, timeout: float | None
+    expert: Expert, opener: Callable[[], Policy] | None, workers: int, timeout: float | None
 ) -> Expert:
     """Return the expert, asked by processes that each hold a copy of it.
 
@@ -90,7 +91,7 @@ def with_processes(
 class _Thread:
     """Answers in the thread that asks; Python can't stop one."""
 
-    def __init__(self, answer: Answer) -> None:
+    def __init__(self, answer: Policy) -> None:
         self.answer = answer
 
     def recover(self) -> None:

@@ -11,7 +11,7 @@ from typing import Protocol
 
 import numpy as np
 
-from fdtasil.experts.expert import Answer
+from fdtasil.rollouts.behaviours import Policy
 
 __all__ = ["Asker", "WorkerPool"]
 
@@ -24,7 +24,7 @@ class Asker(Protocol):
         ...
 
     def answer(self, rows: np.ndarray, /) -> np.ndarray:
-        """Answer one batch; never called twice at a time."""
+        """Policy one batch; never called twice at a time."""
         ...
 
     def stop(self) -> None:
@@ -44,7 +44,7 @@ class WorkerPool:
         weakref.finalize(self, _close, os.getpid(), self._executor, tuple(askers))
 
     def each(
-        self, ask: Callable[[np.ndarray, Answer], np.ndarray], batches: Sequence[np.ndarray]
+        self, ask: Callable[[np.ndarray, Policy], np.ndarray], batches: Sequence[np.ndarray]
     ) -> list[np.ndarray]:
         """Return `ask(batch, answer)` of every batch, in their order.
 
@@ -84,7 +84,7 @@ class WorkerPool:
 class _Call:
     """One call of `each`: who is busy with its batches, and whether it is over."""
 
-    ask: Callable[[np.ndarray, Answer], np.ndarray]
+    ask: Callable[[np.ndarray, Policy], np.ndarray]
     busy: set[Asker] = field(default_factory=set)
     over: threading.Event = field(default_factory=threading.Event)
 

@@ -1,66 +1,19 @@
-"""The policy that is kept: normalise, MLP, action bounds; its own files."""
+"""The policy that is kept: normalise, network, action bounds; its own file."""
 
-import json
-from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass
-from itertools import pairwise
-from numbers import Integral
+from collections.abc import Mapping
 
 import numpy as np
-import safetensors.torch
 import torch
 from torch import Tensor, nn
 
-from fdtasil.errors import SettingError, StorageError
+from fdtasil.compute import ask_module
+from fdtasil.errors import SettingError, StorageError, first_line
+from fdtasil.files.tensors import tensors_from_bytes, tensors_to_bytes
+from fdtasil.student.architectures import Architecture, architecture_of, describe
 
-__all__ = ["ACTIVATIONS", "Student", "StudentShape", "check_shape"]
+__all__ = ["Student"]
 
-ACTIVATIONS: dict[str, Callable[[], nn.Module]] = {
-    "elu": nn.ELU,
-    "gelu": nn.GELU,  # the exact one: the tanh approximation is five times slower on a CPU
-    "relu": nn.ReLU,
-    "silu": nn.SiLU,
-    "tanh": nn.Tanh,
-}
-
-
-_HEADER = "fdtasil"
-
-
-@dataclass(frozen=True)
-class StudentShape:
-    """What a student's network looks like.
-
-    Attributes:
-        observation_size: n.
-        action_size: m.
-        hidden: Width of each hidden layer; empty for a linear policy.
-        activation: One of `ACTIVATIONS`.
-    """
-
-    observation_size: int
-    action_size: int
-    hidden: tuple[int, ...]
-    activation: str
-
-    def __post_init__(self) -> None:
-        check_shape(self.hidden, self.activation)
-
-
-def check_shape(hidden: Sequence[int], activation: str) -> None:
-    """Check what a caller says of a network.
-
-    Raises:
-        SettingError: If a width is not a positive integer, or the activation is unknown.
-    """
-    if activation not in ACTIVATIONS:
-        raise SettingError(
-            f"activation={activation!r}",
-            f"one of {', '.join(ACTIVATIONS)}",
-            'write for example activation="gelu"',
-        )
-    if not all(isinstance(width, Integral) and width > 0 for width in hidden):
-        raise SettingError(f"hidden={hidden!r}", "positive integers", "write (256, 256)")
+_ENTRY = "fdtasil"  # of the metadata of a file of weights
 
 
 class Student(nn.Module):
@@ -70,7 +23,7 @@ class Student(nn.Module):
     ONNX file, and nobody has to apply them outside.
 
     Args:
-        shape: The network.
+        architecture: Of the network.
         mean: (n,) subtracted from observations.
         scale: (n,) divided by; positive.
         low: (m,) action bounds; the output of a bounded action is a scaled tanh.
@@ -88,7 +41,7 @@ class Student(nn.Module):
 
     def __init__(
         self,
-        shape: StudentShape,
+        architecture: Architecture,
         mean: np.ndarray,
         scale: np.ndarray,
         low: np.ndarray,
@@ -96,10 +49,10 @@ class Student(nn.Module):
         random: torch.Generator,
     ) -> None:
         super().__init__()
-        self.shape = shape
+        self.architecture = architecture
         for name, value in {"mean": mean, "scale": scale, "low": low, "high": high}.items():
             self.register_buffer(name, torch.from_numpy(np.array(value, np.float32)))
-        self.network = _mlp(shape, random)
+        self.network = architecture.build(len(mean), len(low), random)
         bounded = np.isfinite(low) & np.isfinite(high)
         # Constants of the graph, from the bounds; safetensors has no use for them.
         centre = np.where(bounded, (np.where(bounded, high, 0) + np.where(bounded, low, 0)) / 2, 0)
@@ -108,6 +61,16 @@ class Student(nn.Module):
         self.register_buffer("_bounded", torch.from_numpy(bounded), persistent=False)
         self.register_buffer("_centre", torch.from_numpy(centre).float(), persistent=False)
         self.register_buffer("_half", torch.from_numpy(half).float(), persistent=False)
+
+    @property
+    def observation_size(self) -> int:
+        """n, the length of an observation."""
+        return len(self.mean)
+
+    @property
+    def action_size(self) -> int:
+        """m, the length of an action."""
+        return len(self.low)
 
     def forward(self, observations: Tensor) -> Tensor:
         """(B, n) raw observations -> (B, m) actions in environment units."""
@@ -119,9 +82,7 @@ class Student(nn.Module):
 
     def act(self, observations: np.ndarray) -> np.ndarray:
         """Answer as a policy: (B, n) float32 -> (B, m) float32."""
-        with torch.no_grad():
-            batch = torch.from_numpy(np.ascontiguousarray(observations, np.float32))
-            return self(batch.to(self.mean.device)).cpu().numpy()
+        return ask_module(self, observations)
 
     def predict(
         self,
@@ -145,7 +106,7 @@ class Student(nn.Module):
             SettingError: If the observations have another shape.
         """
         rows = np.asarray(observation, np.float32)
-        n = self.shape.observation_size
+        n = self.observation_size
         if rows.ndim not in (1, 2) or rows.shape[-1] != n:
             raise SettingError(
                 f"observation of shape {rows.shape}",
@@ -157,10 +118,9 @@ class Student(nn.Module):
 
     def to_bytes(self, metadata: Mapping[str, str] | None = None) -> bytes:
         """Return the student as a safetensors file; equal students give equal bytes."""
-        tensors = {name: tensor.cpu().contiguous() for name, tensor in self.state_dict().items()}
-        about = {"student": asdict(self.shape), **(metadata or {})}
-        # One entry: safetensors writes several in an order that differs from run to run.
-        return safetensors.torch.save(tensors, {_HEADER: json.dumps(about)})
+        sizes = {"observation_size": self.observation_size, "action_size": self.action_size}
+        about = {"student": {**sizes, **describe(self.architecture)}, **(metadata or {})}
+        return tensors_to_bytes(self.state_dict(), about, _ENTRY)
 
     @classmethod
     def from_bytes(cls, data: bytes) -> "Student":
@@ -169,35 +129,16 @@ class Student(nn.Module):
         Raises:
             StorageError: If it is not a student's file.
         """
+        tensors, about = tensors_from_bytes(data, _ENTRY, "a student's weights")
         try:
-            tensors = safetensors.torch.load(data)
-            size = int.from_bytes(data[:8], "little")
-            header = json.loads(data[8 : 8 + size])["__metadata__"][_HEADER]
-            fields = json.loads(header)["student"]
-            shape = StudentShape(**{**fields, "hidden": tuple(fields["hidden"])})
+            fields = {k: v for k, v in about["student"].items() if not k.endswith("_size")}
             bounds = {name: tensors[name].numpy() for name in ("mean", "scale", "low", "high")}
-            student = cls(shape, **bounds, random=torch.Generator())
+            student = cls(architecture_of(fields), **bounds, random=torch.Generator())
             student.load_state_dict(tensors)
-        except (safetensors.SafetensorError, KeyError, TypeError, ValueError, RuntimeError) as e:
+        except (KeyError, TypeError, ValueError, RuntimeError) as error:
             raise StorageError(
-                f"not a student's weights: {type(e).__name__} {e}".splitlines()[0],
+                f"not a student's weights: {type(error).__name__} {first_line(error)}",
                 "a student.safetensors written by fdtasil",
                 "check the path, or save again",
-            ) from e
+            ) from error
         return student.eval()
-
-
-def _mlp(shape: StudentShape, random: torch.Generator) -> nn.Sequential:
-    widths = (shape.observation_size, *shape.hidden)
-    layers: list[nn.Module] = []
-    for inputs, outputs in pairwise(widths):
-        layers += [_linear(inputs, outputs, random), ACTIVATIONS[shape.activation]()]
-    return nn.Sequential(*layers, _linear(widths[-1], shape.action_size, random))
-
-
-def _linear(inputs: int, outputs: int, random: torch.Generator) -> nn.Linear:
-    """Return a layer with orthogonal weights, without touching torch's global generator."""
-    layer = nn.Linear(inputs, outputs, device="meta").to_empty(device="cpu")
-    nn.init.orthogonal_(layer.weight, generator=random)
-    nn.init.zeros_(layer.bias)
-    return layer

@@ -1,0 +1,81 @@
+"""Recording and labelling the episodes of a round, whoever its trainer lets act."""
+
+from collections import Counter
+from dataclasses import dataclass
+
+from fdtasil.demonstrations.dataset import Dataset
+from fdtasil.demonstrations.states import label
+from fdtasil.demonstrations.trainers import Situation, Trainer
+from fdtasil.experts.expert import Expert
+from fdtasil.progress import Progress
+from fdtasil.rollouts.behaviours import Behaviour, Policy
+from fdtasil.rollouts.environments import EnvironmentPool
+from fdtasil.rollouts.episodes import Episodes, check_episodes
+from fdtasil.rollouts.rollout import rollout
+from fdtasil.run.checkpoints import Collected
+from fdtasil.seeding import episode_seeds, generator
+
+__all__ = ["Collecting"]
+
+
+@dataclass(frozen=True)
+class Collecting:
+    """Records episodes.
+
+    Attributes:
+        trainer: Who acts in which round.
+        expert: Labels what was visited.
+        pool: The environment.
+        horizon: T, steps after which an episode is cut.
+        seed: Of starts and noise.
+        progress: Progress bars.
+    """
+
+    trainer: Trainer
+    expert: Expert
+    pool: EnvironmentPool
+    horizon: int
+    seed: int
+    progress: Progress
+
+    def record(
+        self, round_: int, count: int, before: Collected | None, student: Policy | None
+    ) -> Collected:
+        """Record and label `count` episodes.
+
+        Args:
+            round_: The round.
+            count: Number of episodes.
+            before: What earlier rounds have collected.
+            student: The last round's policy; None in round 0.
+
+        Returns:
+            The dataset of these episodes alone, and the counts of all.
+        """
+        first = before.episodes if before else 0
+        behaviour = self._behaviour(round_, student)
+        episodes = self._episodes(behaviour, "rollout", first, count)
+        if round_ == 0:  # every trainer's expert acts alone there
+            check_episodes(episodes, self.pool.name)
+        states = label(episodes, self.expert, first, round_)
+        boxes, counts = self.pool.boxes, Counter(before.counts if before else {})
+        counts["clipped_actions"] += episodes.clipped_actions
+        counts["physics_resets"] += int(episodes.physics_resets.sum())
+        counts["terminated_episodes"] += int(episodes.terminated.sum())
+        dataset = Dataset(states, None, None, boxes.low, boxes.high, self.pool.name)
+        return Collected(dataset, first + len(episodes.valid), counts)
+
+    def _behaviour(self, round_: int, student: Policy | None) -> Behaviour:
+        """Return who acts in a round, which may take a few more episodes to find out."""
+
+        def record_extra(behaviour: Behaviour, extra: int) -> Episodes:
+            return self._episodes(behaviour, f"extra {round_}", 0, extra)
+
+        return self.trainer.behaviour(Situation(round_, self.expert, student, record_extra))
+
+    def _episodes(self, behaviour: Behaviour, stream: str, first: int, count: int) -> Episodes:
+        numbers = range(first, first + count)
+        noise = [generator(self.seed, f"{stream} noise", episode) for episode in numbers]
+        seeds = episode_seeds(self.seed, stream, first, count)
+        with self.progress.bar("demonstrations", "step", count * self.horizon) as bar:
+            return rollout(behaviour, self.pool, seeds, self.horizon, noise, bar.move)

@@ -1,0 +1,193 @@
+"""`fdtasil distill`: a run from a shell, with a baseline beside it, and gone on with."""
+
+import json
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
+from pathlib import Path
+from typing import Any
+
+from fdtasil.errors import SettingError
+from fdtasil.experts.expert import rows_text
+from fdtasil.experts.load import load_expert
+from fdtasil.files.lock import locked
+from fdtasil.files.storage import is_written, to_json, write_bytes
+from fdtasil.results.distilled import Distilled
+from fdtasil.results.evaluation import Evaluation, interval_text, score_text
+from fdtasil.run.pipeline import distill
+from fdtasil.shell.beside import evaluated_beside
+from fdtasil.shell.call import distil
+from fdtasil.shell.command import (
+    Flags,
+    OptionalEnvironment,
+    OptionalExpert,
+    OptionalText,
+    as_command,
+    import_module_of,
+)
+from fdtasil.student.architectures import Mlp
+from fdtasil.student.fit import Fit
+
+__all__ = ["command"]
+
+_FILE = "command.json"
+"""File of a run's folder with the arguments that `fdtasil distill` was called with."""
+_BESIDE = ("resume", "max_queries", "device", "baseline")  # may be said of a run that goes on
+
+
+def _distill(baseline: bool, **arguments: Any) -> None:
+    resume = arguments["resume"]
+    if arguments["device"] is None:
+        del arguments["device"]  # the library's own, or the one that the run was begun on
+    import_module_of(arguments["env"])
+    if resume is not None and arguments["expert"] is None and arguments["env"] is None:
+        _check_alone(resume, sys.argv)
+        mine = {name: arguments.get(name) for name in _BESIDE}
+        mine = {name: value for name, value in mine.items() if value is not None}
+        arguments = {**_remembered(resume), **mine}
+    out = arguments["out"] if resume is None else resume
+    plainly = {**arguments, "probes": 0, "out": None, "resume": None, "log_formats": ()}
+    with evaluated_beside(plainly if baseline else None) as cloning:
+        if resume is None:
+            with _remembering(arguments):
+                result = distil(arguments)
+        else:
+            result = distil({**arguments, "out": None})  # it stays in its own folder
+        print(_side_by_side(result, cloning()))
+    print(f"queries: {rows_text(result.queries)}")
+    print(f"saved in {out}: student.onnx, student.safetensors, report.json, figures/, ...")
+
+
+@contextmanager
+def _remembering(arguments: dict[str, Any]) -> Iterator[None]:
+    """Keep the arguments of a run beside it, for `--resume`; not those of one that never began."""
+    folder: Path = arguments["out"]
+    if (folder / "checkpoints").exists():  # of another run, which is refused in a moment
+        yield
+        return
+    if is_written(folder):
+        print(f"{folder} holds a finished run, which this one replaces", file=sys.stderr)
+    plain = {k: str(v) if isinstance(v, Path) else v for k, v in arguments.items()}
+    path = folder / _FILE
+    with locked(folder):  # another run's arguments stay its own
+        before = path.read_bytes() if path.exists() else None
+        write_bytes(path, to_json(plain))
+    try:
+        yield
+    except BaseException:
+        if not (folder / "checkpoints").exists():
+            if before is None:
+                path.unlink(missing_ok=True)
+                with suppress(OSError):  # only an empty folder goes
+                    folder.rmdir()
+            else:
+                write_bytes(path, before)
+        raise
+
+
+def _check_alone(resume: Path, line: list[str]) -> None:
+    """Refuse flags beside a `--resume` that remembers them all.
+
+    Raises:
+        SettingError: If there are some.
+    """
+    flags = [word.partition("=")[0] for word in line if word.startswith("--")]
+    given = [flag for flag in flags if flag[2:].replace("-", "_") not in _BESIDE]
+    if given:
+        raise SettingError(
+            f"{', '.join(given)} beside --resume {resume}",
+            "--resume alone: a run goes on as it was begun",
+            "leave them out, or begin another run with --out",
+        )
+
+
+def _remembered(folder: Path) -> dict[str, Any]:
+    """Return the arguments that a run was begun with.
+
+    Raises:
+        SettingError: If there are none, or the environment would import a module that only a
+            file names.
+    """
+    try:
+        arguments = json.loads((folder / _FILE).read_bytes())
+    except (OSError, ValueError) as error:
+        raise SettingError(
+            f"{folder / _FILE} can't be read ({type(error).__name__})",
+            "a folder that `fdtasil distill --out` has begun",
+            f"repeat the arguments: fdtasil distill EXPERT ENV ... --resume {folder}",
+        ) from error
+    if ":" in (arguments["env"] or ""):
+        raise SettingError(
+            f"{folder / _FILE} names the environment {arguments['env']!r}",
+            "an id without a module: importing one runs code, and a file may not ask for that",
+            f"repeat the arguments: fdtasil distill EXPERT ENV ... --resume {folder}",
+        )
+    if arguments["trust"] is not None:
+        raise SettingError(
+            f"{folder / _FILE} says trust={arguments['trust']!r}",
+            "trust from the caller, never from a file",
+            f"repeat the arguments: fdtasil distill EXPERT ENV ... --resume {folder}",
+        )
+    tuples = {name: tuple(v) for name, v in arguments.items() if isinstance(v, list)}
+    return {**arguments, **tuples}
+
+
+def _side_by_side(result: Distilled, cloning: Evaluation | None) -> str:
+    """Return a table of expert, plain cloning and student."""
+    ours = result.evaluation
+    if ours is None:
+        return f"{result.report['env']}: trained without an evaluation"
+    lines = [
+        f"{result.report['env']}, {ours.episodes} paired episodes of {ours.horizon} steps",
+        f"{'':15}{'return':>10}{'normalised':>12}{'95 % interval':>18}{'survival':>10}",
+        f"{'expert':15}{ours.expert_return:10.1f}{1:12.3f}{'':18}{ours.expert_survival:10.2f}",
+    ]
+    for name, e in {"plain cloning": cloning, "student": ours}.items():
+        if e is not None:
+            lines.append(
+                f"{name:15}{e.student_return:10.1f}{score_text(e.normalized_return):>12}"
+                f"{interval_text(e.ci95):>18}{e.survival:10.2f}"
+            )
+    return "\n".join(lines)
+
+
+command = as_command(
+    _distill,
+    [
+        Flags(
+            distill,
+            without=("student", "fit", "callback", "progress", "out", "device"),
+            types={
+                "expert": OptionalExpert,
+                "env": OptionalEnvironment,
+                "probes": str | None,
+                "trainer": str,
+                "dataset": str | None,
+                "student_obs": tuple[int, ...] | None,
+                "resume": Path | None,
+            },
+        ),
+        Flags(Mlp, types={"hidden": tuple[int, ...]}, open=True),
+        Flags(Fit, open=True),
+        Flags(load_expert, only=("output", "trust")),
+    ],
+    {
+        "log_formats": (
+            tuple[str, ...],
+            (),
+            "Some of stdout, log, csv, json, tensorboard: logs in the folder `log` of the run.",
+        ),
+        "out": (Path, Path("runs/latest"), "Folder of the run."),
+        "device": (
+            OptionalText,
+            None,
+            'Where the student is trained: "cpu" (as without it), "cuda", "cuda:N"; beside '
+            "--resume, where it goes on.",
+        ),
+        "baseline": (
+            bool,
+            False,
+            "Also clone plainly, without probes, in a process beside it, and show both.",
+        ),
+    },
+)

@@ -1,0 +1,36 @@
+"""`fdtasil evaluate`: a policy beside an expert, from the same starts."""
+
+from typing import Any
+
+from fdtasil.experts.load import load_expert
+from fdtasil.run.pipeline import evaluate
+from fdtasil.shell.call import opened
+from fdtasil.shell.command import EnvironmentId, Flags, PolicyPath, as_command, import_module_of
+
+__all__ = ["command"]
+
+
+def _evaluate(expert: str, env: str, output: str | None, trust: Any, **arguments: Any) -> None:
+    import_module_of(env)
+    judge = opened(expert, env, output=output, trust=trust)
+    assert judge is not None
+    print(evaluate(expert=judge, env=env, **arguments))
+
+
+command = as_command(
+    _evaluate,
+    [
+        Flags(
+            evaluate,
+            without=("progress",),
+            types={
+                "policy": PolicyPath,
+                "env": EnvironmentId,
+                "expert": str,
+                "student_obs": tuple[int, ...] | None,
+            },
+        ),
+        Flags(load_expert, only=("output", "trust")),
+    ],
+    {},
+)
