@@ -15,12 +15,11 @@ from fdtasil.demonstrations.states import Demonstrations
 from fdtasil.errors import SettingError, StorageError
 from fdtasil.experts.expert import rows_text
 from fdtasil.experts.onnx_expert import COLUMNS
-from fdtasil.files.onnx.export import export_module
 from fdtasil.files.storage import to_json, verify, write_bytes, write_folder
 from fdtasil.probes.answers import Answers
-from fdtasil.probes.calibration import Calibration
 from fdtasil.results.evaluation import Evaluation
-from fdtasil.results.figures import draw_calibration, draw_returns, draw_training
+from fdtasil.results.figures import FIGURES
+from fdtasil.student.exports import export
 from fdtasil.student.policy import Student
 from fdtasil.student.view import StudentObservation, View
 
@@ -44,14 +43,14 @@ class Distilled:
         settings: The exact arguments and what they resolved to, with versions; plain JSON.
         report: What `report.json` holds.
         dataset: The labelled states and the expert's answers around them; give it to
-            `distill(demonstrations=...)` to train another student without asking.
+            `distill(dataset=...)` to train another student without asking.
 
     Example:
         >>> import fdtasil, numpy as np
         >>> result = fdtasil.distill(
         ...     lambda x: np.clip(-8 * np.arctan2(x[:, 1:2], x[:, :1]) - 2 * x[:, 2:], -2, 2),
-        ...     "Pendulum-v1", probes="sphere:2,forward", episodes=1, horizon=20, steps=20,
-        ...     hidden=(8,), evaluation_episodes=2,
+        ...     "Pendulum-v1", probes="sphere:2,forward", episodes=1, horizon=20,
+        ...     evaluation_episodes=2, student=fdtasil.Mlp(8), fit=fdtasil.Fit(steps=20),
         ... )
         >>> result.queries["probe"]
         40
@@ -86,34 +85,39 @@ class Distilled:
         """The expert's answers to the probes, or None."""
         return self.dataset.answers
 
-    def onnx_bytes(self) -> bytes:
-        """Return the student as one ONNX file, compared with torch on its own training states.
+    def export(self, path: str | Path) -> Path:
+        """Write the student as the file that the suffix of a path asks for.
+
+        Args:
+            path: Ends with ".onnx" (input `obs` (batch, n), output `actions`, normaliser and
+                action bounds inside; `metadata_props` says the rest) or ".safetensors".
 
         Raises:
-            ExportError: If the two differ by more than 1e-5.
-        """
-        states = self.demonstrations.observations
-        chosen = np.linspace(0, len(states) - 1, min(len(states), _PARITY_STATES)).astype(int)
-        return export_module(self.student, self.view.look(states[chosen]), self._metadata())
-
-    def to_onnx(self, path: str | Path) -> Path:
-        """Write the student as one ONNX file: input `obs` (batch, n), output `actions`.
-
-        Normaliser and action bounds are inside; `metadata_props` says the rest.
-
-        Raises:
-            ExportError: If the file's answers differ from torch's by more than 1e-5.
+            SettingError: If there is no such target.
+            ExportError: If the file's answers on 1,000 of the student's own training states
+                differ from torch's by more than 1e-5.
             StorageError: If it can't be written.
         """
-        write_bytes(Path(path), self.onnx_bytes())
+        write_bytes(Path(path), self.export_bytes(path))
         return Path(path)
+
+    def to_onnx(self, path: str | Path) -> Path:
+        """Write the student as one ONNX file, whatever its name; see `export`."""
+        write_bytes(Path(path), self.export_bytes("student.onnx"))
+        return Path(path)
+
+    def export_bytes(self, name: str | Path) -> bytes:
+        """Return what `export` writes to a file of that name."""
+        states = self.demonstrations.observations
+        chosen = np.linspace(0, len(states) - 1, min(len(states), _PARITY_STATES)).astype(int)
+        return export(self.student, self.view.look(states[chosen]), self._metadata(), name)
 
     def save(self, folder: str | Path) -> Path:
         """Write the run folder.
 
         Files: config.json, report.json, progress.csv, demonstrations.npz, student.safetensors,
-        student.onnx, figures/training.png, figures/returns.png (of an evaluation),
-        figures/calibration.png (of an expert that was probed), and last a manifest.
+        student.onnx, the pictures of `FIGURES` that there is something to draw for, and last a
+        manifest.
 
         Raises:
             StorageError: If a file can't be written; finished files stay whole.
@@ -122,14 +126,13 @@ class Distilled:
             "config.json": to_json(self.settings),
             "progress.csv": _csv(self.history),
             "demonstrations.npz": self.dataset.to_bytes(),
-            "student.safetensors": self.student.to_bytes(self._metadata()),
-            "student.onnx": self.onnx_bytes(),
-            "figures/training.png": draw_training(self.history),
-            **self._calibration_picture(),
+            **{name: self.export_bytes(name) for name in ("student.safetensors", "student.onnx")},
             "report.json": to_json(self.report),
         }
-        if self.evaluation is not None:
-            files["figures/returns.png"] = draw_returns(self.evaluation)
+        for name, draw in FIGURES.items():
+            picture = draw(self)
+            if picture is not None:
+                files[f"figures/{name}.png"] = picture
         write_folder(Path(folder), files)
         return Path(folder)
 
@@ -169,12 +172,6 @@ class Distilled:
                 "a run folder written by this version of fdtasil",
                 "check the path, or run distill again",
             ) from error
-
-    def _calibration_picture(self) -> dict[str, bytes]:
-        found = self.report["calibration"]
-        if found is None:
-            return {}
-        return {"figures/calibration.png": draw_calibration(Calibration.from_json(found))}
 
     def _metadata(self) -> Mapping[str, str]:
         low, high = self.student.low.tolist(), self.student.high.tolist()

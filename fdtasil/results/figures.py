@@ -1,17 +1,16 @@
 """Pictures of a run; matplotlib is loaded when one is drawn."""
 
 import io
-from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Callable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, Protocol
 
+from fdtasil.probes.calibration import Calibration
 from fdtasil.results.evaluation import Evaluation, interval_text, score_text
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-    from fdtasil.probes.calibration import Calibration
-
-__all__ = ["draw_calibration", "draw_returns", "draw_training", "png_of"]
+__all__ = ["FIGURES", "draw_calibration", "draw_returns", "draw_training", "png_of"]
 
 _STUDENT, _EXPERT = "#1f77b4", "#444444"
 
@@ -68,7 +67,7 @@ def draw_returns(evaluation: Evaluation) -> bytes:
     return png_of(figure)
 
 
-def draw_calibration(found: "Calibration") -> bytes:
+def draw_calibration(found: Calibration) -> bytes:
     """Draw how the expert's answers change with the distance of a probe, as a PNG."""
     figure = _figure(7.0, 3.0)
     change, agreement = figure.subplots(1, 2)
@@ -113,3 +112,32 @@ def png_of(figure: "Figure", dpi: int = 150) -> bytes:
     target = io.BytesIO()
     figure.savefig(target, format="png", dpi=dpi, metadata={"Software": None})
     return target.getvalue()
+
+
+class Drawn(Protocol):
+    """What pictures are drawn of: a `Distilled`."""
+
+    history: list[dict[str, float]]
+    evaluation: Evaluation | None
+    report: dict[str, Any]
+
+
+def _training(result: Drawn) -> bytes:
+    return draw_training(result.history)
+
+
+def _returns(result: Drawn) -> bytes | None:
+    return None if result.evaluation is None else draw_returns(result.evaluation)
+
+
+def _calibration(result: Drawn) -> bytes | None:
+    found: Mapping[str, Any] | None = result.report["calibration"]
+    return None if found is None else draw_calibration(Calibration.from_json(found))
+
+
+FIGURES: dict[str, Callable[[Any], bytes | None]] = {
+    "training": _training,
+    "returns": _returns,
+    "calibration": _calibration,
+}
+"""The pictures of a run's folder, by name: a `Drawn` -> a PNG, or None where it has no such."""

@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from fdtasil.compute import ask_module
 from fdtasil.errors import SettingError, StorageError, first_line
+from fdtasil.files.onnx.graph import Graph
 from fdtasil.files.tensors import tensors_from_bytes, tensors_to_bytes
 from fdtasil.student.architectures import Architecture, architecture_of, describe
 
@@ -79,6 +80,22 @@ class Student(nn.Module):
         if not self._all_bounded:
             squashed = torch.where(self._bounded, squashed, raw)
         return self._centre + self._half * squashed
+
+    def write(self, graph: Graph, value: str) -> str:
+        """Add the nodes of the student to an ONNX graph; see `Writable`."""
+        centred = graph.node("Sub", value, graph.constant(self.mean))
+        raw = graph.module(self.network, graph.node("Div", centred, graph.constant(self.scale)))
+        if not self._bounded.any():
+            return raw
+        squashed = graph.node("Tanh", raw)
+        actions = graph.node("Mul", squashed, graph.constant(self._half))
+        if self._centre.any():
+            actions = graph.node("Add", actions, graph.constant(self._centre))
+        if self._all_bounded:
+            return actions
+        share = graph.constant(self._bounded.float())  # of the bounded actions; the rest is raw
+        rest = graph.node("Mul", raw, graph.constant(1 - self._bounded.float()))
+        return graph.node("Add", graph.node("Mul", actions, share), rest)
 
     def act(self, observations: np.ndarray) -> np.ndarray:
         """Answer as a policy: (B, n) float32 -> (B, m) float32."""

@@ -13,6 +13,7 @@ from fdtasil.errors import ExpertError, shown
 from fdtasil.experts.sb3.recipes import Recipe
 from fdtasil.experts.sb3.spaces import Bounds
 from fdtasil.experts.sb3.trust import TRUST
+from fdtasil.files.onnx.graph import Graph
 
 __all__ = ["Clip", "Normalise", "Rescale", "build_network"]
 
@@ -54,6 +55,14 @@ class Normalise(nn.Module):
         normalised = (observations - self.mean - self.rest) / self.scale
         return normalised.clamp(-self.clip, self.clip)
 
+    def write(self, graph: Graph, value: str) -> str:
+        """Add its nodes to an ONNX graph; see `Writable`."""
+        for shift in (self.mean, self.rest):
+            value = graph.node("Sub", value, graph.constant(shift))
+        normalised = graph.node("Div", value, graph.constant(self.scale))
+        low, high = graph.constant(-self.clip), graph.constant(self.clip)
+        return graph.node("Clip", normalised, low, high)
+
 
 class _Bounded(nn.Module):
     low: Tensor
@@ -72,6 +81,13 @@ class Rescale(_Bounded):
         """(B, m) in -1..1 -> (B, m) in environment units."""
         return self.low + 0.5 * (squashed + 1.0) * (self.high - self.low)
 
+    def write(self, graph: Graph, value: str) -> str:
+        """Add its nodes to an ONNX graph; see `Writable`."""
+        shifted = graph.node("Add", value, graph.constant(1.0))
+        halved = graph.node("Mul", shifted, graph.constant(0.5))
+        scaled = graph.node("Mul", halved, graph.constant(self.high - self.low))
+        return graph.node("Add", scaled, graph.constant(self.low))
+
 
 class Clip(_Bounded):
     """Clips actions to the bounds."""
@@ -79,6 +95,11 @@ class Clip(_Bounded):
     def forward(self, actions: Tensor) -> Tensor:
         """(B, m) -> (B, m), both in environment units."""
         return torch.minimum(torch.maximum(actions, self.low), self.high)
+
+    def write(self, graph: Graph, value: str) -> str:
+        """Add its nodes to an ONNX graph; see `Writable`."""
+        raised = graph.node("Max", value, graph.constant(self.low))
+        return graph.node("Min", raised, graph.constant(self.high))
 
 
 def build_network(

@@ -4,25 +4,28 @@ import logging
 import warnings
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
+from importlib.util import find_spec
 from typing import TYPE_CHECKING
 
 import numpy as np
 import torch
 
 from fdtasil.errors import ExportError, first_line
+from fdtasil.files.onnx.graph import OPSET, can_write, write_model
 from fdtasil.files.onnx.session import open_session, run_session
 
 if TYPE_CHECKING:
     import onnx
 
-
-_OPSET = 18  # old enough for the runtimes on robots, new enough for torch's exporter
+__all__ = ["export_module"]
 
 
 def export_module(
     module: torch.nn.Module, observations: np.ndarray, metadata: Mapping[str, str]
 ) -> bytes:
     """Write a torch policy as one self-contained ONNX file, and compare the two.
+
+    Known layers are written node by node; for others torch's exporter traces the module.
 
     The graph has one input `obs` (batch, n), one output `actions` (batch, m), both float32, and
     a free batch. Equal modules give equal bytes.
@@ -45,9 +48,13 @@ def export_module(
     training = module.training
     module.eval()
     try:
-        model = _export_graph(module, example)
         with torch.no_grad():
             expected = module(example).numpy()
+        model = (
+            write_model(module, example.shape[1], expected.shape[1])
+            if can_write(module)
+            else _traced(module, example)
+        )
     finally:
         module.train(training)
     onnx.helper.set_model_props(model, dict(metadata))
@@ -69,7 +76,13 @@ def export_module(
     return model.SerializeToString(deterministic=True)
 
 
-def _export_graph(module: torch.nn.Module, example: torch.Tensor) -> "onnx.ModelProto":
+def _traced(module: torch.nn.Module, example: torch.Tensor) -> "onnx.ModelProto":
+    if find_spec("onnxscript") is None:
+        raise ExportError(
+            f"{type(module).__name__} has layers that only torch's exporter can write",
+            "the package onnxscript, which it needs",
+            'pip install "fdtasil[export]"',
+        )
     try:
         with _silenced():
             program = torch.onnx.export(
@@ -77,7 +90,7 @@ def _export_graph(module: torch.nn.Module, example: torch.Tensor) -> "onnx.Model
                 (example[:2],),
                 dynamo=True,
                 external_data=False,
-                opset_version=_OPSET,
+                opset_version=OPSET,
                 input_names=["obs"],
                 output_names=["actions"],
                 dynamic_shapes=({0: torch.export.Dim("batch")},),
@@ -92,9 +105,11 @@ def _export_graph(module: torch.nn.Module, example: torch.Tensor) -> "onnx.Model
             "replace the operation named above",
         ) from error
     # The exporter writes stack traces with folder names of this machine into every node.
-    for part in (*model.graph.node, *model.graph.value_info, model.graph, *model.functions):
+    for part in (*model.graph.node, model.graph, *model.functions):
         del part.metadata_props[:]
         part.doc_string = ""
+    # Shapes of initialisers, which onnxruntime's quantisation trips over, and of the rest.
+    del model.graph.value_info[:]
     return model
 
 
