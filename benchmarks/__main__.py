@@ -1,15 +1,15 @@
-"""`python -m benchmarks list | run NAME | draw NAME`."""
+"""`python -m benchmarks list | run NAME | draw NAME`.
+
+A benchmark is a module of this package with a `BENCHMARK`; no other file names it.
+"""
 
 import argparse
+import pkgutil
 import sys
+from importlib import import_module
 from pathlib import Path
 
 import benchmarks
-from benchmarks.finite_difference import FINITE_DIFFERENCE
-from benchmarks.non_differentiable import NON_DIFFERENTIABLE
-from benchmarks.quality import QUALITY
-from benchmarks.queries import QUERIES
-from benchmarks.robustness import ROBUSTNESS
 from benchmarks.runner import (
     BACKENDS,
     FIGURES,
@@ -22,28 +22,20 @@ from benchmarks.runner import (
     results_of,
     run,
 )
-from benchmarks.speed import SPEED
-from benchmarks.stability import STABILITY
-from benchmarks.trainers import MUJOCO
-from benchmarks.training_length import TRAINING_LENGTH
 from fdtasil.compute import pick_device
 from fdtasil.errors import SettingError
 from fdtasil.files.storage import write_bytes
 
-BENCHMARKS: dict[str, Benchmark] = {
-    benchmark.name: benchmark
-    for benchmark in (
-        FINITE_DIFFERENCE,
-        MUJOCO,
-        QUERIES,
-        ROBUSTNESS,
-        QUALITY,
-        NON_DIFFERENTIABLE,
-        STABILITY,
-        TRAINING_LENGTH,
-        SPEED,
-    )
-}
+
+def _found() -> dict[str, Benchmark]:
+    """Return the benchmarks of this package by name, in the order of the alphabet."""
+    names = sorted(module.name for module in pkgutil.iter_modules(benchmarks.__path__))
+    modules = [import_module(f"benchmarks.{name}") for name in names if name != "__main__"]
+    held = [module.BENCHMARK for module in modules if hasattr(module, "BENCHMARK")]
+    return {benchmark.name: benchmark for benchmark in held}
+
+
+BENCHMARKS = _found()
 
 
 def main() -> int:

@@ -1,13 +1,15 @@
 """The cell that most benchmarks share: distil one expert with one setting and seed."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import fields
 from typing import Any
 
 import fdtasil
 from benchmarks.controllers import CONTROLLERS
 from benchmarks.runner import Benchmark, Cell, Row
+from fdtasil.run.presets import preset_of
 
-__all__ = ["HORIZON", "STEPS", "distillations", "usual_arguments"]
+__all__ = ["HORIZON", "STEPS", "call_of", "distillations", "usual_arguments"]
 
 HORIZON = 300
 STEPS = 4_000  # of all, however much data they have: none is trained longer than another
@@ -27,7 +29,7 @@ def distillations(
         about: What it shows.
         cells: Whether to be quick -> the cells.
         arguments: A cell -> `expert`, a name of `CONTROLLERS`, and those arguments of `distill`
-            that are not left at their defaults.
+            that are not left at their defaults, as `call_of` takes them.
         draw: Rows -> files.
     """
 
@@ -43,13 +45,32 @@ def usual_arguments(cell: Cell) -> dict[str, Any]:
     return given | {"horizon": HORIZON, "steps": STEPS}
 
 
-def _distil(expert: str, **arguments: Any) -> dict[str, Any]:
+def call_of(settings: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the arguments of `distill` that flat settings stand for.
+
+    Stored results are found by their settings: flat, they stay what they are when the library
+    groups its arguments anew.
+
+    Args:
+        settings: Arguments of `distill`, the fields of `Fit` and `Mlp` beside them; `Fit`'s that
+            are left out are the preset's.
+    """
+    rest = dict(settings)
+    of_fit, of_student = (
+        {field.name: rest.pop(field.name) for field in fields(kind) if field.name in rest}
+        for kind in (fdtasil.Fit, fdtasil.Mlp)
+    )
+    preset = preset_of(rest.get("preset", "standard"))
+    return {**rest, "student": fdtasil.Mlp(**of_student), "fit": preset.fit_with(**of_fit)}
+
+
+def _distil(expert: str, **settings: Any) -> dict[str, Any]:
     """Distil, and return what tables and figures need of the report."""
     path, environment = CONTROLLERS[expert].open()
-    result = fdtasil.distill(path, environment, progress=False, **arguments)
+    result = fdtasil.distill(path, environment, progress=False, **call_of(settings))
     report, evaluation = result.report, result.evaluation
     assert evaluation is not None
-    names = ("train_seconds", "steps", "queries", "radius", "weight", "probes", "warnings")
+    names = ("train_seconds", "steps", "queries", "radius", "probes", "warnings")
     return {
         "normalized_return": evaluation.normalized_return,
         "student_return": evaluation.student_return,

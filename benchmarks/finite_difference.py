@@ -4,14 +4,11 @@ from collections.abc import Sequence
 from typing import Any
 
 from benchmarks.comparison import draw_scores, scores_of, scores_text
-from benchmarks.controllers import available
 from benchmarks.distillation import distillations, usual_arguments
+from benchmarks.grid import SEEDS, STANDARD_METHODS, experts, label
 from benchmarks.runner import Cell, Row
 
-__all__ = ["FINITE_DIFFERENCE", "SEEDS", "STANDARD_METHODS", "experts", "label"]
-
-ENVIRONMENTS = ("Walker2d", "HalfCheetah", "Ant", "Humanoid")
-SEEDS = range(5)
+__all__ = ["BENCHMARK"]
 
 PRESETS: dict[str, dict[str, Any]] = {
     # What a user gets who sets nothing; beyond five trajectories, who sets the steps alone.
@@ -31,13 +28,6 @@ GRID = (
     ("standard", 10),
     ("standard", 50),
 )
-STANDARD_METHODS: dict[str, dict[str, Any]] = {
-    "plain": {"probes": 0},
-    "jacobian": {"probes": "jacobian"},
-    **{str(count): {"probes": count} for count in (1, 5, 10, 50)},
-    # A moved state's label counts as much as a visited state's.
-    "augmentation": {"probes": "adaptive:10,labels", "weight": 1.0},
-}
 METHODS: dict[str, dict[str, dict[str, Any]]] = {
     "standard": STANDARD_METHODS,
     "paper": {
@@ -47,6 +37,8 @@ METHODS: dict[str, dict[str, dict[str, Any]]] = {
         "augmentation": {"probes": "sphere:10,labels,per_step=1", "weight": 1.0},
     },
 }
+# The appendix's claims, and the baseline: ours - theirs on equal seeds.
+PAIRS = (("1", "jacobian"), ("10", "jacobian"), ("10", "1"), ("50", "1"), ("10", "augmentation"))
 
 
 def cells(quick: bool) -> list[Cell]:
@@ -60,31 +52,10 @@ def cells(quick: bool) -> list[Cell]:
     ]
 
 
-def experts() -> list[str]:
-    """Return the paper's experts where they are, this project's otherwise."""
-    here = available(*(f"paper/{name}" for name in ENVIRONMENTS))
-    return here or available(*(f"{name}-v5" for name in ENVIRONMENTS))
-
-
 def arguments(cell: Cell) -> dict[str, Any]:
     """Return the cell's method, with its preset."""
     preset, method = cell["preset"], cell["method"]
     return usual_arguments(cell) | PRESETS[preset] | METHODS[preset][method]
-
-
-# The appendix's claims, and the rival: ours - theirs on equal seeds.
-PAIRS = (("1", "jacobian"), ("10", "jacobian"), ("10", "1"), ("50", "1"), ("10", "augmentation"))
-_LABELS = {
-    "plain": "plain cloning",
-    "jacobian": "analytic Jacobian",
-    "1": "1 probe",
-    "augmentation": "10 answers as labels",
-}
-
-
-def label(method: str) -> str:
-    """Return what figures call a method; a number is one of probes."""
-    return _LABELS.get(method, f"{method} probes" if method.isdigit() else method)
 
 
 def draw(rows: Sequence[Row]) -> dict[str, bytes]:
@@ -101,4 +72,4 @@ def draw(rows: Sequence[Row]) -> dict[str, bytes]:
     return files and files | {"finite_difference.md": text.strip().encode() + b"\n"}
 
 
-FINITE_DIFFERENCE = distillations("finite_difference", __doc__ or "", cells, arguments, draw)
+BENCHMARK = distillations("finite_difference", __doc__ or "", cells, arguments, draw)

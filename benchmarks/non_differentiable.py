@@ -8,13 +8,13 @@ from typing import Any
 
 import fdtasil
 from benchmarks.black_boxes import BLACK_BOXES
+from benchmarks.grid import SEEDS
 from benchmarks.runner import Benchmark, Cell, Row
 from benchmarks.statistics import interval_text
 from benchmarks.tables import table
 
-__all__ = ["NON_DIFFERENTIABLE"]
+__all__ = ["BENCHMARK"]
 
-SEEDS = range(5)
 PROBES = (10, 0)
 # Rows that a slow expert may be asked in all; a setting that would ask more is refused at once.
 SLOW_BUDGET = 20_000
@@ -63,7 +63,7 @@ def run(cell: Cell, device: str) -> dict[str, Any]:
 def draw(rows: Sequence[Row]) -> dict[str, bytes]:
     """One table: kinds down, plain cloning and probes across."""
     heads = ["expert", "environment", "expert's return", "plain cloning", "10 probes"]
-    heads += ["worst seed", "questions to learn from", "seconds, plain and with probes", "probes"]
+    heads += ["worst seed", "queries to learn from", "seconds, plain and with probes", "probes"]
     lines: list[list[str]] = []
     for kind in BLACK_BOXES:
         mine = [row for row in rows if row["cell"]["black_box"] == kind]
@@ -80,7 +80,7 @@ def _line(kind: str, ours: list[dict[str, Any]], plain: list[dict[str, Any]]) ->
     if not ours or not plain:
         return []
     scores, base = ([r["normalized_return"] for r in results] for results in (ours, plain))
-    # The comparison's own questions are left out: a user who does not compare does not ask them.
+    # The comparison's own queries are left out: a user who does not compare does not make them.
     asked = _mean([sum(r["queries"].values()) - r["queries"]["evaluate"] for r in ours])
     seconds = [_mean([r["seconds"] for r in results]) for results in (plain, ours)]
     sources = ", ".join(dict.fromkeys(r["probes"] for r in ours))
@@ -94,4 +94,4 @@ def _mean(values: Sequence[float]) -> float:
     return sum(values) / len(values)
 
 
-NON_DIFFERENTIABLE = Benchmark("non_differentiable", __doc__ or "", cells, run, draw)
+BENCHMARK = Benchmark("non_differentiable", __doc__ or "", cells, run, draw)

@@ -4,13 +4,13 @@ from collections.abc import Sequence
 
 from benchmarks.controllers import available
 from benchmarks.distillation import distillations
+from benchmarks.grid import SEEDS
 from benchmarks.runner import Cell, Row
 from benchmarks.statistics import difference_text, interval_text, paired_difference
 from benchmarks.tables import table
 
-__all__ = ["QUALITY"]
+__all__ = ["BENCHMARK"]
 
-SEEDS = range(5)
 # Episodes and steps: the usual budget, little data, and the whole length of an episode.
 BUDGETS = ((5, 300), (2, 300), (1, 300), (5, 1000))
 PROBES = (10, 0)
@@ -71,4 +71,4 @@ def _line(rows: Sequence[Row], head: list[str]) -> list[list[str]]:
     return [[*head, *cells]]
 
 
-QUALITY = distillations("quality", __doc__ or "", cells, dict, draw)
+BENCHMARK = distillations("quality", __doc__ or "", cells, dict, draw)

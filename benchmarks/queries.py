@@ -1,4 +1,4 @@
-"""Is a question better spent on a probe, or on another trajectory: return against questions."""
+"""Is a query better spent on a probe, or on another trajectory: return against queries."""
 
 from collections.abc import Mapping, Sequence
 from typing import Any
@@ -6,15 +6,15 @@ from typing import Any
 import numpy as np
 
 from benchmarks.distillation import distillations, usual_arguments
-from benchmarks.finite_difference import SEEDS, STANDARD_METHODS, experts, label
+from benchmarks.grid import SEEDS, STANDARD_METHODS, experts, label
 from benchmarks.panels import draw_panels
 from benchmarks.runner import Cell, Row
 from benchmarks.statistics import difference_text, interval_text, paired_difference
 from benchmarks.tables import table
 
-__all__ = ["QUERIES"]
+__all__ = ["BENCHMARK"]
 
-# Trajectories of each method. The rivals' go far enough to ask what 10 probes of 5 ask.
+# Trajectories of each method. The baselines' go far enough to ask what 10 probes of 5 ask.
 BUDGETS: dict[str, tuple[int, ...]] = {
     "plain": (2, 5, 10, 20, 40, 80),
     "plain, longer": (80,),
@@ -33,14 +33,14 @@ LABELS = {method: label(method) for method in BUDGETS} | {
     "plain, longer": "plain cloning, three times the steps",
     "dagger": "DAgger",
 }
-RIVALS = ("plain", "plain, longer", "dagger")
+BASELINES = ("plain", "plain, longer", "dagger")
 # The answers that a student learns from; the gate's and the evaluation's are asked of all.
 PURPOSES = ("act", "label", "calibrate", "probe")
 
-_HEADS = ("expert", "method", "trajectories", "questions")
+_HEADS = ("expert", "method", "trajectories", "queries")
 
 Curves = Mapping[str, Mapping[int, Mapping[int, tuple[int, float]]]]
-"""method -> trajectories -> seed -> (questions, score)."""
+"""method -> trajectories -> seed -> (queries, score)."""
 
 
 def cells(quick: bool) -> list[Cell]:
@@ -64,7 +64,7 @@ def draw(rows: Sequence[Row]) -> dict[str, bytes]:
     curves = _curves(rows)
     if not curves:
         return {}
-    text = f"{_scores(curves)}\nAgainst a rival that asks no less:\n\n{_differences(curves)}"
+    text = f"{_scores(curves)}\nAgainst a baseline that asks no less:\n\n{_differences(curves)}"
     return {"queries.png": _picture(curves), "queries.md": text.encode()}
 
 
@@ -88,17 +88,17 @@ def _curves(rows: Sequence[Row]) -> dict[str, Curves]:
     }
 
 
-def _at_no_less(curves: Curves, ours: tuple[str, int], rival: str) -> dict[int, float] | None:
-    """Return, by seed, what the rival reaches with its least budget that asks no less than ours.
+def _at_no_less(curves: Curves, ours: tuple[str, int], baseline: str) -> dict[int, float] | None:
+    """Return, by seed, what the baseline reaches with its least budget that asks no less.
 
-    The rival asks up to twice (DAgger four times) as much: no line has to be drawn between its
+    The baseline asks up to twice (DAgger four times) as much: no line has to be drawn between its
     budgets, and what is won is won in spite of it. None where it asks less at its largest.
     """
     asked = _asked(curves[ours[0]][ours[1]])
-    enough = [count for count in BUDGETS[rival] if _asked(curves[rival][count]) >= asked]
+    enough = [count for count in BUDGETS[baseline] if _asked(curves[baseline][count]) >= asked]
     if not enough:
         return None
-    return {seed: score for seed, (_, score) in curves[rival][min(enough)].items()}
+    return {seed: score for seed, (_, score) in curves[baseline][min(enough)].items()}
 
 
 def _asked(points: Mapping[int, tuple[int, float]]) -> float:
@@ -125,28 +125,29 @@ def _returns(points: Mapping[int, tuple[int, float]]) -> list[float]:
 
 
 def _differences(curves: Mapping[str, Curves]) -> str:
-    """Return a table of paired differences, ours - a rival's who asks no less."""
+    """Return a table of paired differences, ours - a baseline's who asks no less."""
     rows = []
     for expert, of_expert in curves.items():
         for method, count in _ours():
             scores = {seed: score for seed, (_, score) in of_expert[method][count].items()}
-            rivals = [_at_no_less(of_expert, (method, count), rival) for rival in RIVALS]
-            if not any(rivals):
+            ours = method, count
+            against = [_at_no_less(of_expert, ours, baseline) for baseline in BASELINES]
+            if not any(against):
                 continue
             texts = [
                 difference_text(*paired_difference(scores, theirs)) if theirs else "asks less"
-                for theirs in rivals
+                for theirs in against
             ]
             rows.append([*_head(expert, of_expert, method, count), *texts])
-    return table([*_HEADS, *(f"- {LABELS[rival]}" for rival in RIVALS)], rows)
+    return table([*_HEADS, *(f"- {LABELS[baseline]}" for baseline in BASELINES)], rows)
 
 
 def _ours() -> list[tuple[str, int]]:
-    return [(m, count) for m, counts in BUDGETS.items() if m not in RIVALS for count in counts]
+    return [(m, count) for m, counts in BUDGETS.items() if m not in BASELINES for count in counts]
 
 
 def _picture(curves: Mapping[str, Curves]) -> bytes:
-    """Draw return against questions."""
+    """Draw return against queries."""
     experts = {
         expert: {
             LABELS[method]: {
@@ -157,7 +158,7 @@ def _picture(curves: Mapping[str, Curves]) -> bytes:
         }
         for expert, of_expert in curves.items()
     }
-    return draw_panels(experts, "questions that the student learns from")
+    return draw_panels(experts, "queries that the student learns from")
 
 
-QUERIES = distillations("queries", __doc__ or "", cells, arguments, draw)
+BENCHMARK = distillations("queries", __doc__ or "", cells, arguments, draw)

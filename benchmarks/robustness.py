@@ -10,12 +10,12 @@ import numpy as np
 import fdtasil
 from benchmarks.comparison import Column, Scores, draw_scores, scores_text
 from benchmarks.controllers import CONTROLLERS
-from benchmarks.distillation import HORIZON
+from benchmarks.distillation import HORIZON, call_of
 from benchmarks.disturbances import DISTURBANCES, STEPS_BETWEEN_PUSHES, Disturbance
-from benchmarks.finite_difference import SEEDS, STANDARD_METHODS, experts, label
+from benchmarks.grid import SEEDS, STANDARD_METHODS, experts, label
 from benchmarks.runner import Benchmark, Cell, Row
 
-__all__ = ["ROBUSTNESS"]
+__all__ = ["BENCHMARK"]
 
 EPISODES = 5
 EVALUATED = 10  # episodes under each disturbance
@@ -63,7 +63,7 @@ def compare_under_disturbances(
     Args:
         expert: A name of `CONTROLLERS`.
         seed: Of the distillation, the starts and the disturbances.
-        settings: Further arguments of `distill`.
+        settings: Further arguments of `distill`, as `call_of` takes them.
     """
     path, environment = CONTROLLERS[expert].open()
     result = fdtasil.distill(
@@ -74,7 +74,7 @@ def compare_under_disturbances(
         seed=seed,
         evaluation_episodes=0,  # judged below
         progress=False,
-        **settings,
+        **call_of(settings),
     )
     deviations = result.dataset.demonstrations.observations.std(axis=0, dtype=np.float64)
     found: dict[str, Any] = {}
@@ -170,4 +170,4 @@ def _shares(
     return shares
 
 
-ROBUSTNESS = Benchmark("robustness", __doc__ or "", cells, run, draw)
+BENCHMARK = Benchmark("robustness", __doc__ or "", cells, run, draw)

@@ -1,4 +1,4 @@
-"""What a training step, a question and an environment step cost, as ratios to what they must."""
+"""What a training step, a query and an environment step cost, as ratios to what they must."""
 
 import statistics
 import time
@@ -17,18 +17,19 @@ from benchmarks.tables import table
 from fdtasil.compute import torch_settings
 from fdtasil.demonstrations.states import Demonstrations
 from fdtasil.experts.load import load_expert
-from fdtasil.probes.answers import ask_probes
-from fdtasil.probes.scales import measure_scales as scales_of
+from fdtasil.probes.answers import Answers, ask_probes
+from fdtasil.probes.scales import measure_scales
 from fdtasil.probes.source import Probes
 from fdtasil.rollouts.behaviours import follow
 from fdtasil.rollouts.environments import EnvironmentPool
 from fdtasil.rollouts.rollout import rollout
 from fdtasil.run.presets import PRESETS
 from fdtasil.seeding import torch_generator
-from fdtasil.student.fit import fit
-from fdtasil.student.network import Student, StudentShape
+from fdtasil.student.architectures import Mlp
+from fdtasil.student.fit import Fit, fit
+from fdtasil.student.policy import Student
 
-__all__ = ["SPEED"]
+__all__ = ["BENCHMARK"]
 
 SIZES = ((17, 6), (376, 17))
 SOURCES = (None, "sphere:10", "sphere:50", "sphere:10,resample")
@@ -80,7 +81,7 @@ def _step_on_a_gpu(cell: Cell) -> dict[str, Any]:
     tasks = {
         f"{source}, {device}": (_task(n, m, source, device, steps), steps)
         for source in SOURCES
-        for device, steps in (("cpu", STEPS), ("cuda", PRESETS["standard"].fit.steps or STEPS))
+        for device, steps in (("cpu", STEPS), ("cuda", Fit().total_steps(STATES)))
     }
     times: dict[str, list[float]] = {name: [] for name in tasks}
     for task, _ in tasks.values():
@@ -105,24 +106,23 @@ def _task(
     preset = replace(PRESETS["standard"], calibrated=False)
     probes = preset.complete(Probes.parse(spec))
     probes = probes.with_order(1) if probes else None
-    scales, settings = scales_of(observations), preset.fit_with(steps=steps)
+    scales, settings = measure_scales(observations), preset.fit_with(steps=steps)
     ones = np.ones(m, np.float32)
 
     def run() -> None:
-        shape = StudentShape(n, m, (HIDDEN, HIDDEN), "gelu")
         start = torch_generator(0, "student")
-        student = Student(shape, scales.mean, scales.scale, -ones, ones, start)
+        student = Student(Mlp((HIDDEN, HIDDEN)), scales.mean, scales.scale, -ones, ones, start)
         fit(student.to(device), demonstrations, probes, ask if probes else None, settings, stream)
 
-    def asked(pool: int) -> Any:
+    def asked(sample: int) -> Answers:
         assert probes is not None
-        return ask_probes(expert, observations, probes, scales, np.random.default_rng(pool))
+        return ask_probes(expert, observations, probes, scales, np.random.default_rng(sample))
 
     # Stored answers are asked once for a whole training, of which this is a short piece.
     stored = asked(0) if probes else None
 
-    def ask(pool: int) -> Any:
-        return asked(pool) if pool else stored
+    def ask(sample: int) -> Answers:
+        return asked(sample) if sample or stored is None else stored
 
     def stream(name: str) -> torch.Generator:
         return torch_generator(0, name)
@@ -241,4 +241,4 @@ def _line(what: str, of: str, ours: Sequence[float], theirs: Sequence[float]) ->
     return [what, of, f"{min(ratios):.2f}", f"{statistics.median(ratios):.2f}"]
 
 
-SPEED = Benchmark("speed", __doc__ or "", cells, measure, draw, alone=True)
+BENCHMARK = Benchmark("speed", __doc__ or "", cells, measure, draw, alone=True)

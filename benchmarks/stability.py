@@ -18,9 +18,10 @@ from benchmarks.synthetic_system import (
     make_expert,
 )
 from fdtasil.rollouts.behaviours import Policy
+from fdtasil.run.presets import preset_of
 from fdtasil.seeding import generator
 
-__all__ = ["STABILITY", "follow_student"]
+__all__ = ["BENCHMARK", "follow_student"]
 
 SEEDS = range(10)
 STEPS = 4500
@@ -71,16 +72,18 @@ def run(cell: Cell, device: str) -> dict[str, Any]:
         # Raw states and every probe in every step: with these the library's first-order term is
         # the paper's, the unsquared Frobenius norm of the Jacobian's error.
         preset="paper",
-        weight=1.0,
-        # The library's term is the size of z'Hz for standard normal z, which is at least sqrt(2)
-        # times the Frobenius norm of H (1.5 times for the difference of two experts): this is
-        # the paper's 10, or a little more.
-        curvature_weight=10.0 / 2**0.5,
-        order=max(1, order),
+        fit=preset_of("paper").fit_with(
+            steps=cell["steps"],
+            order=max(1, order),
+            weight=1.0,
+            # The library's term is the size of z'Hz for standard normal z, which is at least
+            # sqrt(2) times the Frobenius norm of H (1.5 times for the difference of two experts):
+            # this is the paper's 10, or a little more.
+            curvature_weight=10.0 / 2**0.5,
+        ),
+        student=fdtasil.Mlp((64, 64, 64)),
         episodes=DEMONSTRATIONS,
         horizon=HORIZON,
-        hidden=(64, 64, 64),
-        steps=cell["steps"],
         seed=seed,
         device=device,
         evaluation_episodes=0,  # judged below
@@ -155,4 +158,4 @@ def _short(values: np.ndarray) -> Any:
     return float(f"{values:.4g}") if values.ndim == 0 else [_short(value) for value in values]
 
 
-STABILITY = Benchmark("stability", __doc__ or "", cells, run, draw)
+BENCHMARK = Benchmark("stability", __doc__ or "", cells, run, draw)

@@ -5,10 +5,10 @@ from typing import Any
 
 from benchmarks.comparison import draw_methods, scores_of
 from benchmarks.distillation import STEPS, distillations, usual_arguments
-from benchmarks.finite_difference import SEEDS, experts
+from benchmarks.grid import SEEDS, experts
 from benchmarks.runner import Cell, Row
 
-__all__ = ["TRAINING_LENGTH"]
+__all__ = ["BENCHMARK"]
 
 BUDGETS = (5, 20)
 LENGTHS = (STEPS, 2 * STEPS)
@@ -41,4 +41,4 @@ def draw(rows: Sequence[Row]) -> dict[str, bytes]:
     return draw_methods("training_length", scores, list(METHODS), PAIRS)
 
 
-TRAINING_LENGTH = distillations("training_length", __doc__ or "", cells, arguments, draw)
+BENCHMARK = distillations("training_length", __doc__ or "", cells, arguments, draw)

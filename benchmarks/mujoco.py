@@ -6,10 +6,10 @@ from typing import Any
 from benchmarks.comparison import Column, Scores, draw_scores, scores_of, scores_text
 from benchmarks.controllers import available
 from benchmarks.distillation import distillations, usual_arguments
-from benchmarks.finite_difference import SEEDS, experts
+from benchmarks.grid import SEEDS, experts
 from benchmarks.runner import Cell, Row
 
-__all__ = ["MUJOCO"]
+__all__ = ["BENCHMARK"]
 
 BUDGETS = (5, 20)
 SOURCES: dict[str, int | str] = {"plain": 0, "probes": 10, "jacobian": "jacobian"}
@@ -74,4 +74,4 @@ def _by_trainer(scores: Scores, budget: Column) -> Scores:
     }
 
 
-MUJOCO = distillations("mujoco", __doc__ or "", cells, arguments, draw)
+BENCHMARK = distillations("mujoco", __doc__ or "", cells, arguments, draw)
