@@ -15,7 +15,13 @@ import fdtasil
 
 GAIN = np.array([[-0.5, 0.1, -0.7, 0.0, 0.0], [0.0, -0.4, 0.1, -0.6, 0.0]], np.float32)
 TOY = "toy_environments:toy/Integrator-v0"
-QUICK = {"episodes": 2, "steps": 40, "hidden": (16,), "evaluation_episodes": 2, "horizon": 20}
+QUICK = {
+    "episodes": 2,
+    "horizon": 20,
+    "student": fdtasil.Mlp(16),
+    "fit": fdtasil.Fit(steps=40),
+    "evaluation_episodes": 2,
+}
 
 SHARED = Path(__file__).parent.parent.parent / "shared"
 
@@ -75,7 +81,7 @@ def untouched_global_randomness():
     assert torch.equal(before[1], after[1])
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def linear():
     """The expert x -> GAIN x, whose Jacobian is GAIN everywhere."""
     return lambda observations: observations @ GAIN.T
@@ -141,7 +147,23 @@ def _tensor(array: np.ndarray, name: str, dtype: np.dtype) -> onnx.TensorProto:
     return numpy_helper.from_array(array.astype(dtype), name)
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def quick(linear):
-    """A small distillation of the linear expert."""
+    """A small distillation of the linear expert; it is not to be changed."""
     return fdtasil.distill(linear, TOY, 3, **QUICK)
+
+
+@pytest.fixture(scope="session")
+def quick_folder(quick, tmp_path_factory):
+    """Where it is saved; not to be changed either."""
+    return quick.save(tmp_path_factory.mktemp("quick") / "run")
+
+
+@pytest.fixture
+def nothing_is_trained(monkeypatch):
+    """Training fails the test: what is refused here is refused before."""
+
+    def never(*arguments, **named):
+        raise AssertionError("training began")
+
+    monkeypatch.setattr("fdtasil.run.training.fit", never)

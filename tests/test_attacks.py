@@ -22,7 +22,7 @@ from sb3_agents import Marker, booby_trap, make_agent, rewrite, save_agent
 
 import fdtasil
 from fdtasil.errors import ExpertError, FdtasilError, SettingError
-from fdtasil.student.network import Student
+from fdtasil.student.policy import Student
 
 
 def pickled(protocol, marker):
@@ -169,7 +169,7 @@ def test_demonstrations_are_no_pickle(tmp_path):
     for content in contents:
         path.write_bytes(content)
         with pytest.raises(FdtasilError):
-            fdtasil.distill(demonstrations=path, probes=0, steps=1)
+            fdtasil.distill(dataset=path, probes=0, fit=fdtasil.Fit(steps=1))
     assert not marker.exists()
 
 
@@ -187,7 +187,7 @@ def remembered(folder, **changes):
     ],
 )
 def test_a_file_can_not_ask_for_an_import_or_for_trust(changes, found, tmp_path, monkeypatch):
-    from fdtasil.shell.main import _remembered
+    from fdtasil.shell.distill import _remembered
 
     (tmp_path / "attacker.py").write_text("open('marker', 'w').close()")
     monkeypatch.chdir(tmp_path)

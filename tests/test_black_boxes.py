@@ -18,7 +18,13 @@ from benchmarks.black_boxes.forest import make_forest
 from benchmarks.black_boxes.int8 import make_int8
 from benchmarks.black_boxes.mpc import SamplingController, make_mpc
 
-QUICK = {"episodes": 2, "horizon": 10, "steps": 20, "hidden": (16,), "evaluation_episodes": 2}
+QUICK = {
+    "episodes": 2,
+    "horizon": 10,
+    "student": fdtasil.Mlp(16),
+    "fit": fdtasil.Fit(steps=20),
+    "evaluation_episodes": 2,
+}
 TINY = {
     "forest": partial(make_forest, trees=4, rounds=2, episodes=1, horizon=20),
     "int8": partial(make_int8, episodes=1, horizon=20),

@@ -22,7 +22,14 @@ CELLS = [
     for stencil in ("forward", "central")
     if not (source == "none" and stencil == "central")
 ] + [(trainer, source) for trainer in TRAINERS for source in ("jacobian", "sphere:3,labels")]
-QUICK = {"episodes": 4, "horizon": 10, "epochs": 5, "hidden": (8,), "evaluation_episodes": 1}
+EPOCHS = 5
+QUICK = {
+    "episodes": 4,
+    "horizon": 10,
+    "student": fdtasil.Mlp(8),
+    "fit": fdtasil.Fit(epochs=EPOCHS),
+    "evaluation_episodes": 1,
+}
 
 
 @pytest.fixture(scope="module")
@@ -60,7 +67,8 @@ def test_every_cell_keeps_the_contract(trainer, source, expert):
 @pytest.mark.parametrize("trainer", TRAINERS)
 @pytest.mark.parametrize("source", ["sphere:2,central", "jacobian"])
 def test_second_order_in_every_trainer(trainer, source, expert):
-    result = fdtasil.distill(expert, TOY, source, trainer=TRAINERS[trainer], order=2, **QUICK)
+    quick = {**QUICK, "fit": fdtasil.Fit(epochs=EPOCHS, order=2)}
+    result = fdtasil.distill(expert, TOY, source, trainer=TRAINERS[trainer], **quick)
     assert all(entry["curvature_error"] > 0 for entry in result.history)
     assert result.queries["probe"] == (160 if "sphere" in source else 0)
 

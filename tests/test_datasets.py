@@ -5,6 +5,7 @@ import pytest
 from conftest import QUICK, TOY, mlp_onnx
 
 import fdtasil
+from fdtasil import Fit, Mlp
 from fdtasil.demonstrations.dataset import Dataset, load_dataset
 from fdtasil.errors import SettingError, StorageError
 from fdtasil.student.view import View
@@ -14,44 +15,45 @@ def never(observations):
     raise AssertionError("asked")
 
 
+SMALL = {"student": Mlp(4), "fit": Fit(steps=30)}
+
+
 @pytest.fixture
-def run(quick, tmp_path):
-    return quick.save(tmp_path / "run")
+def run(quick_folder):
+    """A run's folder, which is not to be changed."""
+    return quick_folder
 
 
 @pytest.mark.parametrize("kind", ["folder", "file", "dataset"])
 def test_another_student_without_one_question(kind, run, quick):
     source = {"folder": run, "file": run / "demonstrations.npz", "dataset": quick.dataset}[kind]
-    result = fdtasil.distill(demonstrations=source, hidden=(4, 4), steps=30)
+    result = fdtasil.distill(dataset=source, student=Mlp((4, 4)), fit=Fit(steps=30))
     assert sum(result.queries.values()) == 0
     assert result.evaluation is None
-    assert result.student.shape.hidden == (4, 4)
+    assert result.student.architecture == Mlp((4, 4))
     assert result.history[0]["derivative_error"] > 0
     assert result.report["probes"] == quick.report["probes"]
 
 
 def test_the_same_training_as_the_run_itself(run, quick):
-    settings = {"hidden": QUICK["hidden"], "steps": QUICK["steps"]}
-    again = fdtasil.distill(demonstrations=run, **settings)
+    again = fdtasil.distill(dataset=run, student=QUICK["student"], fit=QUICK["fit"])
     assert again.student.to_bytes() == quick.student.to_bytes()
 
 
 def test_only_the_evaluation_asks(run, linear):
-    result = fdtasil.distill(linear, TOY, demonstrations=run, **QUICK)
+    result = fdtasil.distill(linear, TOY, dataset=run, **QUICK)
     assert result.queries["act"] == result.queries["label"] == result.queries["probe"] == 0
     assert result.queries["evaluate"] > 0
     assert result.evaluation.episodes == 2
 
 
 def test_stored_probes_can_be_left_or_added(run, linear, tmp_path):
-    plain = fdtasil.distill(demonstrations=run, probes=0, hidden=(4,), steps=30)
+    plain = fdtasil.distill(dataset=run, probes=0, **SMALL)
     assert plain.history[0]["derivative_error"] == 0
     bare = plain.save(tmp_path / "bare")
     with pytest.raises(SettingError, match="without an expert to ask"):
-        fdtasil.distill(demonstrations=Dataset.from_bytes(_without_answers(run)), hidden=(4,))
-    added = fdtasil.distill(
-        linear, demonstrations=Dataset.from_bytes(_without_answers(run)), hidden=(4,), steps=30
-    )
+        fdtasil.distill(dataset=Dataset.from_bytes(_without_answers(run)), **SMALL)
+    added = fdtasil.distill(linear, dataset=Dataset.from_bytes(_without_answers(run)), **SMALL)
     assert added.queries["probe"] == 10 * len(added.demonstrations)
     assert load_dataset(bare).answers is not None  # what was asked is never thrown away
 
@@ -74,9 +76,9 @@ def test_missing_parts_are_named(run, linear, tmp_path):
     with pytest.raises(SettingError, match="no env"):
         fdtasil.distill(linear)
     with pytest.raises(SettingError, match="sizes"):
-        fdtasil.distill(env="Pendulum-v1", demonstrations=run)
+        fdtasil.distill(env="Pendulum-v1", dataset=run)
     with pytest.raises(StorageError, match="can't be read"):
-        fdtasil.distill(demonstrations=tmp_path / "nothing")
+        fdtasil.distill(dataset=tmp_path / "nothing")
 
 
 # --- the student sees less than the expert
@@ -94,10 +96,10 @@ MASK = np.array([True, True, True, True, False])
 def test_the_student_sees_less(student_obs, trainer, linear):
     quick = {**QUICK, "episodes": 3}
     result = fdtasil.distill(linear, TOY, 3, student_obs=student_obs, trainer=trainer, **quick)
-    assert result.student.shape.observation_size == 4
+    assert result.student.observation_size == 4
     assert result.demonstrations.observations.shape[1] == 5
     assert result.evaluation.normalized_return > 0.5
-    assert len(result.onnx_bytes()) > 100
+    assert len(result.export_bytes("student.onnx")) > 100
 
 
 def test_probes_follow_what_the_student_sees(linear):
@@ -119,7 +121,7 @@ def test_a_curved_function_needs_the_forward_stencil(linear):
         return np.concatenate([observations[:, :4], observations[:, :1] ** 2], axis=1)
 
     result = fdtasil.distill(linear, TOY, 3, student_obs=curved, **QUICK)
-    assert result.student.shape.observation_size == 5
+    assert result.student.observation_size == 5
     with pytest.raises(SettingError, match="curved"):
         fdtasil.distill(linear, TOY, "sphere:3,central", student_obs=curved, **QUICK)
 
@@ -166,19 +168,35 @@ def test_a_function_as_view_is_given_again_to_load(linear, tmp_path):
     result = fdtasil.distill(linear, TOY, 3, student_obs=seen, **QUICK)
     folder = result.save(tmp_path)
     again = fdtasil.Distilled.load(folder, student_obs=seen)
-    assert again.onnx_bytes() == result.onnx_bytes()
+    assert again.export_bytes("student.onnx") == result.export_bytes("student.onnx")
     with pytest.raises(SettingError, match="the function seen"):
-        fdtasil.Distilled.load(folder).onnx_bytes()
+        fdtasil.Distilled.load(folder).export_bytes("student.onnx")
 
 
 def test_what_is_not_used_is_refused(run, quick):
     with pytest.raises(SettingError, match="trainer='dagger'"):
-        fdtasil.distill(demonstrations=run, trainer="dagger")
+        fdtasil.distill(dataset=run, trainer="dagger")
     with pytest.raises(SettingError, match="stored answers"):
-        fdtasil.distill(demonstrations=run, probes="basis,central")
+        fdtasil.distill(dataset=run, probes="basis,central")
+    with pytest.raises(SettingError, match="episodes=3 with a dataset of 2 episodes"):
+        fdtasil.distill(dataset=run, episodes=3)
     same = quick.report["probes"]
-    result = fdtasil.distill(demonstrations=run, probes=same, hidden=4, steps=5)
-    assert result.report["probes"] == same
+    for said in ({"probes": same}, {"probes": 3}, {"probes": None, "episodes": 2}):
+        result = fdtasil.distill(dataset=run, **said, **SMALL)
+        assert result.report["probes"] == same
+        assert result.settings["episodes"] == 2
+
+
+def test_probes_that_are_left_out_are_those_that_are_stored(linear):
+    """Ten, where nothing is; but who says ten is not given five others."""
+    stored = fdtasil.distill(linear, TOY, "sphere:5", **QUICK)
+    result = fdtasil.distill(dataset=stored.dataset, **SMALL)
+    assert result.report["probes"] == stored.report["probes"]
+    assert result.report["probes"].startswith("sphere:5,")
+    assert result.history[-1]["derivative_error"] > 0
+    for ten in (10, "10", "sphere:10"):
+        with pytest.raises(SettingError, match=r":10.* with stored answers to 'sphere:5,"):
+            fdtasil.distill(dataset=stored.dataset, probes=ten, **SMALL)
 
 
 def test_a_twin_is_probed_too(tmp_path):
@@ -193,9 +211,9 @@ def test_a_folder_with_another_runs_demonstrations_is_refused(linear, tmp_path):
     other = (tmp_path / "1/demonstrations.npz").read_bytes()
     (tmp_path / "0/demonstrations.npz").write_bytes(other)
     with pytest.raises(StorageError, match=r"demonstrations\.npz changed after writing"):
-        fdtasil.distill(demonstrations=tmp_path / "0", steps=5, hidden=4)
+        fdtasil.distill(dataset=tmp_path / "0", **SMALL)
     alone = tmp_path / "0/demonstrations.npz"
-    fdtasil.distill(demonstrations=alone, probes=0, steps=5, hidden=4)
+    fdtasil.distill(dataset=alone, probes=0, **SMALL)
 
 
 def test_a_result_shows_itself_in_a_few_lines(linear):

@@ -5,7 +5,6 @@ import re
 import signal
 import subprocess
 import sys
-import textwrap
 import time
 import traceback
 from pathlib import Path
@@ -59,13 +58,6 @@ def at(number, change):
         return change(*answer) if count == number else answer
 
     return step
-
-
-def no_training(monkeypatch):
-    def never(*arguments, **named):
-        raise AssertionError("training began")
-
-    monkeypatch.setattr("fdtasil.run.training.fit", never)
 
 
 def refused(environment, linear, kind=EnvironmentFault, **changes):
@@ -182,9 +174,7 @@ def test_the_experts_measured_return_is_reported_beside_that_of_chance():
 
 @pytest.mark.fault(67)
 @pytest.mark.parametrize("ends", [(True, False), (False, True)])
-def test_episodes_that_end_at_once_are_refused_before_training(ends, linear, monkeypatch):
-    no_training(monkeypatch)
-
+def test_episodes_that_end_at_once_are_refused_before_training(ends, linear, nothing_is_trained):
     def short():
         return Odd(step=lambda count, x, reward, *_: (x, reward, *ends, {}))
 
@@ -307,8 +297,8 @@ BROKEN = [
 
 @pytest.mark.parametrize(("change", "found"), BROKEN)
 @pytest.mark.filterwarnings("ignore:divide by zero", "ignore:overflow", "ignore:invalid value")
-def test_a_step_that_goes_wrong_is_named_with_episode_and_step(change, found, linear, monkeypatch):
-    no_training(monkeypatch)
+@pytest.mark.usefixtures("nothing_is_trained")
+def test_a_step_that_goes_wrong_is_named_with_episode_and_step(change, found, linear):
     error = refused(lambda: Odd(step=at(7, change)), linear)
     where, _, what = error.found.partition(": ")
     (seed,) = episode_seeds(0, "evaluation", 0, 1)
@@ -403,9 +393,8 @@ def run_forward(rows):
 
 @pytest.mark.fault(76)
 @pytest.mark.parametrize("step", [0, 1, 2, 7])
-def test_physics_that_always_reset_themselves_are_refused_before_training(step, monkeypatch):
+def test_physics_that_always_reset_themselves_are_refused_before_training(step, nothing_is_trained):
     """At the first steps the simulator's clock has no room to go back."""
-    no_training(monkeypatch)
     found = "HalfCheetah-v5: the simulation became unstable and reset itself in 2 of 2 episodes"
     with pytest.warns(FdtasilWarning, match=found):
         error = refused(cheetah(lambda count, _: count == step), run_forward)
@@ -481,9 +470,8 @@ import ctypes, os, sys, time
 import torch
 torch.set_num_threads(1)
 import fdtasil
-from fdtasil import runfolder
-from test_environment_faults import Odd
-runfolder.CHECKPOINT_SECONDS = 0.0
+from conftest import GAIN
+from test_environment_faults import RUN, Odd
 folder, how = sys.argv[1:]
 steps = []
 
@@ -502,9 +490,8 @@ def fate(count, *answer):
 def linear(rows):
     return rows @ GAIN.T
 
-from conftest import GAIN
 try:
-    fdtasil.distill(linear, lambda: Odd(step=fate), 2, out=folder, **{run!r})
+    fdtasil.distill(linear, lambda: Odd(step=fate), 2, out=folder, **RUN)
 except KeyboardInterrupt:
     sys.exit(130)
 """
@@ -526,7 +513,7 @@ def start(*arguments):
 
 
 def child(folder, how):
-    return start("-c", textwrap.dedent(CHILD).replace("{run!r}", repr(RUN)), folder, how)
+    return start("-c", CHILD, folder, how)
 
 
 def goes_on(folder):

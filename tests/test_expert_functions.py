@@ -14,7 +14,7 @@ from sb3_agents import make_agent, save_agent
 
 import fdtasil
 from fdtasil.errors import EnvironmentFault, ExpertError, FdtasilWarning, SettingError
-from fdtasil.experts.gate import check_expert
+from fdtasil.experts.gate import admit_expert
 from fdtasil.rollouts.environments import Boxes
 
 
@@ -296,7 +296,7 @@ def test_a_function_of_one_observation_is_found_out_where_all_sizes_are_equal():
     assert expert.ask(states, "act").shape == (16, 16)
     boxes = Boxes(16, -np.ones(16, np.float32), np.ones(16, np.float32))
     assert "raised ValueError on 1 observations" in error_of(
-        lambda: check_expert(expert, states, boxes)
+        lambda: admit_expert(expert, states, boxes)
     )
 
 

@@ -12,17 +12,14 @@ from fdtasil.compute import pick_device, torch_settings
 from fdtasil.errors import FdtasilWarning, FitError, SettingError
 from fdtasil.probes.answers import Answers
 from fdtasil.probes.scales import measure_scales
-from fdtasil.run.presets import PRESETS
+from fdtasil.run.presets import preset_of
 from fdtasil.student.batches import Batches
-from fdtasil.student.fit import Hooks, fit
-
-STANDARD = PRESETS["standard"]
-
+from fdtasil.student.fit import Fit, Hooks, fit
 
 def train(spec=None, student=None, **changes):
     demonstrations, probes, ask = linear_task(spec=spec)
     student = student or new_student()
-    settings = replace(STANDARD.fit, **{"steps": 300, **changes})
+    settings = Fit(**{"steps": 300, **changes})
     history = fit(student, demonstrations, probes, ask, settings, stream)
     return student, history
 
@@ -38,7 +35,7 @@ def test_every_source_learns(spec):
 def test_probes_teach_the_derivative():
     """On fresh probes around few states, which plain cloning knows nothing about."""
     demonstrations, probes, ask = linear_task(states=12, spec="8")
-    settings = replace(STANDARD.fit, steps=500)
+    settings = Fit(steps=500)
     errors = {}
     for name, source in {"cloning": None, "probes": probes}.items():
         student = new_student()
@@ -58,7 +55,7 @@ def test_the_cost_of_a_step_does_not_grow_with_the_stored_probes():
         for spec in (None, "50") * 3:
             demonstrations, probes, ask = linear_task(states=1000, spec=spec, **sizes)
             student = new_student(**sizes, hidden=(512, 512))
-            settings = replace(STANDARD.fit, steps=60)
+            settings = Fit(steps=60)
             start = time.process_time()
             fit(student, demonstrations, probes, ask, settings, stream)
             cost[spec] = min(cost.get(spec, np.inf), time.process_time() - start)
@@ -76,35 +73,35 @@ def test_every_epoch_visits_each_state_once_and_every_probe_comes_up():
         assert np.array_equal(
             np.sort(states, axis=0), np.sort(demonstrations.observations, axis=0)
         )
-        seen.append(torch.cat([batch.values[:, 0, 0] for batch in dealt]).numpy())
+        seen.append(torch.cat([batch.probes.values[:, 0, 0] for batch in dealt]).numpy())
     stored = answers.values[:, :, 0].reshape(-1, 2)
     used = np.concatenate(seen)
     assert np.array_equal(stored[np.lexsort(stored.T)], used[np.lexsort(used.T)])
 
 
-@pytest.mark.parametrize(("spec", "pools"), [("3", 1), ("3,resample", 4), ("3,per_step=2,resample", 7)])  # fmt: skip  # noqa: E501
-def test_the_expert_is_asked_as_often_as_predicted(spec, pools):
+@pytest.mark.parametrize(("spec", "samples"), [("3", 1), ("3,resample", 4), ("3,per_step=2,resample", 7)])  # fmt: skip  # noqa: E501
+def test_the_expert_is_asked_as_often_as_predicted(spec, samples):
     spec = f"sphere:{spec}"
     demonstrations, probes, ask = linear_task(states=50, spec=spec)
     asked = []
 
-    def counted(pool):
-        asked.append(pool)
-        return ask(pool)
+    def counted(sample):
+        asked.append(sample)
+        return ask(sample)
 
-    settings = replace(STANDARD.fit, steps=20, batch_size=25)
+    settings = Fit(steps=20, batch_size=25)
     fit(new_student(), demonstrations, probes, counted, settings, stream)
     visits = settings.visits(50)
     assert visits == 10
-    assert asked == list(range(pools))
-    assert probes.pools(6, visits) == pools
+    assert asked == list(range(samples))
+    assert probes.samples(6, visits) == samples
 
 
 @pytest.mark.fault(95, 97, 98)
 @pytest.mark.parametrize(("states", "batches"), [(1, [1]), (7, [7]), (101, [51, 50])])
 def test_few_states_and_a_state_left_over(states, batches):
     demonstrations, _, _ = linear_task(states=states)
-    settings = replace(STANDARD.fit, steps=5)
+    settings = Fit(steps=5)
     history = fit(new_student(), demonstrations, None, None, settings, stream)
     assert history[-1]["step"] == 5
     assert np.isfinite(list(history[-1].values())).all()
@@ -118,7 +115,7 @@ def test_a_loss_that_is_not_finite_stops_the_training():
     demonstrations, _, _ = linear_task()
     demonstrations.actions[3, 0] = np.nan
     with pytest.raises(FitError, match=r"the loss became nan at step [12]\n"):
-        fit(new_student(), demonstrations, None, None, STANDARD.fit, stream)
+        fit(new_student(), demonstrations, None, None, Fit(), stream)
 
 
 @pytest.mark.fault(100)
@@ -129,7 +126,7 @@ def test_a_state_that_is_not_finite_is_never_handed_on():
     kept = []
     hooks = Hooks(checkpoint=lambda state: kept.append(state.to_bytes()))
     with pytest.raises(FitError, match="at step") as error:
-        fit(new_student(), demonstrations, None, None, STANDARD.fit, stream, hooks=hooks)
+        fit(new_student(), demonstrations, None, None, Fit(), stream, hooks=hooks)
     assert kept == []
     assert len(str(error.value).splitlines()) <= 6
 
@@ -157,17 +154,25 @@ def test_equal_seeds_give_equal_weights():
 
 
 def test_steps_and_epochs_are_two_ways_to_say_one_thing():
-    assert STANDARD.fit_with(epochs=3).total_steps(200) == 6
-    assert STANDARD.fit_with(epochs=3).visits(200) == 3
-    assert STANDARD.fit_with(steps=7).visits(200) == 4
+    assert Fit(epochs=3).total_steps(200) == 6
+    assert Fit(epochs=3).visits(200) == 3
+    assert Fit(steps=7).visits(200) == 4
     with pytest.raises(SettingError, match="one of the two"):
-        STANDARD.fit_with(steps=1, epochs=1)
+        Fit(steps=1, epochs=1)
+
+
+def test_a_preset_with_other_settings_keeps_the_rest():
+    paper = preset_of("paper")
+    assert paper.fit_with(steps=7) == replace(paper.fit, steps=7, epochs=None)
+    assert paper.fit_with(epochs=3, weight=None) == replace(paper.fit, epochs=3)
+    assert preset_of("standard").fit_with() == Fit()
+    with pytest.raises(SettingError, match="one of the two"):
+        paper.fit_with(steps=1, epochs=1)
 
 
 def test_much_data_is_trained_on_for_longer_unless_steps_are_given():
-    usual = STANDARD.fit.steps
-    assert [STANDARD.fit.total_steps(n) for n in (1, 1500, 6000)] == [usual, usual, 2 * usual]
-    assert STANDARD.fit_with(steps=7).total_steps(6000) == 7
+    assert [Fit().total_steps(n) for n in (1, 1500, 6000)] == [4000, 4000, 8000]
+    assert Fit(steps=7).total_steps(6000) == 7
 
 
 @pytest.mark.parametrize(
@@ -175,7 +180,7 @@ def test_much_data_is_trained_on_for_longer_unless_steps_are_given():
 )
 def test_wrong_settings_are_refused(wrong):
     with pytest.raises(SettingError):
-        STANDARD.fit_with(**wrong)
+        Fit(**wrong)
 
 
 def test_answers_of_two_rounds_are_joined():

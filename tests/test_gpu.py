@@ -1,7 +1,6 @@
 """Training on a GPU: the same students as on the CPU, without a round trip for each step."""
 
 import warnings
-from dataclasses import replace
 from functools import partial
 
 import numpy as np
@@ -12,9 +11,8 @@ from toy_tasks import linear_task, new_student, stream
 
 import fdtasil
 from fdtasil.errors import FitError
-from fdtasil.run.presets import PRESETS
-from fdtasil.student.fit import Hooks, fit
-from fdtasil.student.loss import Minibatch
+from fdtasil.student.fit import Fit, Hooks, fit
+from fdtasil.student.loss import Minibatch, ProbeBatch, TaylorLoss
 from fdtasil.student.step import gradient_step
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
@@ -25,7 +23,7 @@ SPECS = [None, "4", "basis,central", "orthogonal:6", "sphere:2,resample", "spher
 def train(spec, device="cuda", resume=None, checkpoint=lambda state: None, **changes):
     demonstrations, probes, ask = linear_task(states=230, spec=spec)
     student = new_student().to(device)
-    settings = replace(PRESETS["standard"].fit, **{"steps": 300, **changes})
+    settings = Fit(**{"steps": 300, **changes})
     hooks = Hooks(checkpoint=checkpoint)
     history = fit(
         student, demonstrations, probes, ask, settings, stream, hooks=hooks, resume=resume
@@ -108,13 +106,14 @@ def minibatches():
     random = torch.Generator().manual_seed(0)
     for number in range(20):
         rows = 10 + (number > 9)  # the second shape comes up when the first is recorded
-        draws = (torch.randn(rows, size, generator=random).to("cuda") for size in (6, 2))
-        yield Minibatch(*draws, gain=1.0 + (number > 14))
+        draws = [torch.randn(rows, size, generator=random).to("cuda") for size in (6, 2)]
+        around = ProbeBatch(draws[0][:, None], draws[1][:, None, None], 1.0 + (number > 14))
+        yield Minibatch(*draws, around)
 
 
 def loss_of(student, batch):
     error = (student(batch.observations) - batch.actions).norm(dim=1).mean()
-    return batch.gain * torch.stack([error] * 4)
+    return TaylorLoss(*[batch.probes.gain * error] * 4)
 
 
 class Expert(torch.nn.Module):
@@ -134,15 +133,16 @@ class Expert(torch.nn.Module):
         {"probes": 5},
         {"probes": 5, "trainer": "dagger"},
         {"probes": "jacobian"},
-        {"probes": "jacobian", "order": 2},
-        {"probes": "basis,central", "order": 2},
+        {"probes": "jacobian", "fit": Fit(steps=40, order=2)},
+        {"probes": "basis,central", "fit": Fit(steps=40, order=2)},
         {"probes": "sphere:2,resample"},
-        {"probes": 5, "validation": 0.5, "patience": 1},
+        {"probes": 5, "fit": Fit(steps=40, validation=0.5, patience=1)},
     ],
     ids=str,
 )
 def test_a_run_on_the_gpu_gives_a_student_for_the_cpu(setting):
-    result = fdtasil.distill(Expert(), TOY, device="cuda", progress=False, **QUICK, **setting)
+    run = {**QUICK, "device": "cuda", "progress": False, **setting}
+    result = fdtasil.distill(Expert(), TOY, **run)
     assert {weights.device.type for weights in result.student.parameters()} == {"cpu"}
     assert np.isfinite(result.evaluation.normalized_return)
     assert result.settings["device"] == "cuda"

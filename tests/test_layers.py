@@ -18,7 +18,8 @@ FLOORS = [
     {"probes"},
     {"experts"},
     {"rollouts", "files"},
-    {"checks", "seeding", "compute"},
+    {"seeding", "compute"},
+    {"checks"},
     {"errors", "progress"},
 ]
 FLOOR = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}

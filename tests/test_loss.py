@@ -11,15 +11,15 @@ from fdtasil.probes.answers import ask_probes
 from fdtasil.probes.scales import measure_scales
 from fdtasil.probes.source import Probes
 from fdtasil.run.presets import PRESETS
-from fdtasil.student.loss import Minibatch, Weights, taylor_loss
-from fdtasil.student.network import Student, StudentShape
+from fdtasil.student.architectures import Mlp
+from fdtasil.student.loss import Minibatch, ProbeBatch, Weights, taylor_loss
+from fdtasil.student.policy import Student
 
 
 def smooth_expert(n=6, m=3):
     random = torch.Generator().manual_seed(3)
-    shape = StudentShape(n, m, (32, 32), "gelu")
     zeros, ones = np.zeros(n), np.ones(n)
-    return Student(shape, zeros, ones, -np.ones(m), np.ones(m), random).eval()
+    return Student(Mlp((32, 32)), zeros, ones, -np.ones(m), np.ones(m), random).eval()
 
 
 def batch_of(module, spec, states, order=1):
@@ -32,14 +32,13 @@ def batch_of(module, spec, states, order=1):
     expert = load_expert(module, states.shape[1])
     random = np.random.default_rng(0)
     answers = ask_probes(expert, states, probes, measure_scales(states), random, order)
-    batch = Minibatch(
-        torch.from_numpy(states),
-        torch.from_numpy(expert.ask(states, "label")),
+    around = ProbeBatch(
         torch.from_numpy(answers.displacements[answers.numbers]),
         torch.from_numpy(answers.values),
         answers.gain,
     )
-    return batch, probes.stencil
+    labels = torch.from_numpy(expert.ask(states, "label"))
+    return Minibatch(torch.from_numpy(states), labels, around), probes.stencil
 
 
 @pytest.fixture
@@ -54,7 +53,7 @@ def test_the_loss_is_zero_at_the_expert(states, spec):
     expert = smooth_expert()
     batch, stencil = batch_of(expert, spec, states)
     loss = taylor_loss(expert, batch, stencil, Weights(0.5))
-    assert float(loss.total) < 1e-4
+    assert float(loss.loss) < 1e-4
 
 
 def test_the_analytic_loss_and_gradient_agree_with_the_differences(states):
@@ -68,9 +67,9 @@ def test_the_analytic_loss_and_gradient_agree_with_the_differences(states):
         student.zero_grad()
         batch, stencil = batch_of(expert, spec, states)
         loss = taylor_loss(student, batch, stencil, Weights(0.5))
-        loss.total.backward()
+        loss.loss.backward()
         gradient = torch.cat([p.grad.flatten() for p in student.parameters()])
-        found[spec] = loss.total.detach(), gradient
+        found[spec] = loss.loss.detach(), gradient
     (fd_loss, fd_gradient), (loss, gradient) = found.values()
     assert float(abs(fd_loss - loss) / loss) < 1e-3
     assert float((fd_gradient - gradient).norm() / gradient.norm()) < 1e-3
@@ -85,7 +84,7 @@ def test_a_linear_difference_is_the_exact_derivative(states):
     for spec in ("basis", "basis,central,radius=3", "orthogonal:6,radius=1", "jacobian"):
         batch, stencil = batch_of(matrix, spec, states)
         loss = taylor_loss(lambda x: 0 * x[:, :3], batch, stencil, Weights(1.0))
-        assert float(loss.derivative) == pytest.approx(expected, rel=1e-4), spec
+        assert float(loss.derivative_error) == pytest.approx(expected, rel=1e-4), spec
 
 
 def test_labels_are_the_action_error_at_the_moved_states(states):
@@ -95,11 +94,11 @@ def test_labels_are_the_action_error_at_the_moved_states(states):
             parameter.mul_(0.8)
     batch, stencil = batch_of(expert, "sphere:1,labels,radius=0.5", states)
     loss = taylor_loss(student, batch, stencil, Weights(1.0))
-    moved = batch.observations + batch.displacements[:, 0]
+    moved = batch.observations + batch.probes.displacements[:, 0]
     with torch.no_grad():
         error = (student(moved) - expert(moved)).norm(dim=-1).mean()
-    assert float(loss.derivative) == pytest.approx(float(error), rel=1e-4)
-    assert float(loss.total) == pytest.approx(float(loss.action + error), rel=1e-4)
+    assert float(loss.derivative_error) == pytest.approx(float(error), rel=1e-4)
+    assert float(loss.loss) == pytest.approx(float(loss.action_error + error), rel=1e-4)
 
 
 def test_second_differences_agree_with_exact_second_derivatives():
@@ -114,9 +113,9 @@ def test_second_differences_agree_with_exact_second_derivatives():
         student.zero_grad()
         batch, stencil = batch_of(expert, spec, states, order=2)
         loss = taylor_loss(student, batch, stencil, Weights(0.5, 0.1))
-        loss.total.backward()
+        loss.loss.backward()
         gradient = torch.cat([p.grad.flatten() for p in student.parameters()])
-        found[spec] = loss.curvature.detach(), gradient
+        found[spec] = loss.curvature_error.detach(), gradient
     (differences, fd_gradient), (exact, gradient) = found.values()
     assert float(exact) > 0.1
     assert float(abs(differences - exact) / exact) < 0.02
@@ -135,7 +134,7 @@ def test_a_parabola_has_its_own_second_difference(states):
     for spec in ("orthogonal:6,central", "orthogonal:6,central,radius=2", "jacobian"):
         batch, stencil = batch_of(Parabola(), spec, states, order=2)
         loss = taylor_loss(lambda x: 0 * x[:, :1], batch, stencil, Weights(1.0, 1.0))
-        curvatures.append(float(loss.curvature.detach()))
+        curvatures.append(float(loss.curvature_error.detach()))
     # E |u'Hu|, sqrt of the mean over a frame, lies near the trace of the whitened Hessian.
     assert curvatures == pytest.approx([float((states.std(axis=0) ** 2).sum())] * 3, rel=0.05)
 

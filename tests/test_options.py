@@ -1,6 +1,7 @@
 """Options of training that users expect: validation, clipping, callbacks, logs, Minari."""
 
 import csv
+import inspect
 import json
 
 import numpy as np
@@ -9,12 +10,13 @@ import torch
 from conftest import QUICK, TOY
 
 import fdtasil
+from fdtasil import Fit, Mlp
 from fdtasil.errors import FdtasilWarning, SettingError, StorageError
 from fdtasil.student.fit_state import FitState
 
 
 def test_validation_keeps_the_best_weights(linear):
-    held = {**QUICK, "episodes": 5, "steps": 1000, "validation": 0.4}
+    held = {**QUICK, "episodes": 5, "fit": Fit(steps=1000, validation=0.4)}
     result = fdtasil.distill(linear, TOY, 3, **held)
     losses = [entry["validation_loss"] for entry in result.history]
     training = [entry["loss"] for entry in result.history]
@@ -36,30 +38,31 @@ def test_the_best_weights_are_those_of_the_best_validation():
 
 
 def test_patience_stops_early(linear):
-    held = {**QUICK, "episodes": 4, "validation": 0.5, "patience": 2, "learning_rate": 0.0}
-    result = fdtasil.distill(linear, TOY, 0, **{**held, "steps": 5000})
+    held = Fit(steps=5000, validation=0.5, patience=2, learning_rate=0.0)
+    result = fdtasil.distill(linear, TOY, 0, **{**QUICK, "episodes": 4, "fit": held})
     assert [entry["step"] for entry in result.history] == [100, 200, 300]
     assert result.report["steps"] == 300
     with pytest.raises(SettingError, match="patience=2 without validation"):
-        fdtasil.distill(linear, TOY, 0, **QUICK, patience=2)
+        Fit(patience=2)
 
 
 @pytest.mark.fault(96)
 def test_a_single_episode_holds_none_out_and_says_so(linear):
     said = r"validation=0\.3 of a single episode: none is held out"
+    held = Fit(steps=40, validation=0.3)
     with pytest.warns(FdtasilWarning, match=said):
-        result = fdtasil.distill(linear, TOY, 2, **{**QUICK, "episodes": 1}, validation=0.3)
+        result = fdtasil.distill(linear, TOY, 2, **{**QUICK, "episodes": 1, "fit": held})
     entry = result.history[-1]
     assert entry["validation_loss"] == entry["loss"]
     assert len(result.report["warnings"]) == 1
     with pytest.warns(FdtasilWarning, match=said):
-        fdtasil.distill(demonstrations=result.dataset, validation=0.3, steps=5, hidden=4)
+        fdtasil.distill(dataset=result.dataset, student=Mlp(4), fit=held)
 
 
 @pytest.mark.fault(96)
 def test_a_first_round_of_one_episode_is_no_news(linear):
     """The last round has more of them, and holds some out."""
-    run = {**QUICK, "episodes": 3, "validation": 0.3}
+    run = {**QUICK, "episodes": 3, "fit": Fit(steps=40, validation=0.3)}
     result = fdtasil.distill(linear, TOY, 0, trainer="dagger", **run)
     assert result.report["warnings"] == []
     first, last = result.history
@@ -69,15 +72,17 @@ def test_a_first_round_of_one_episode_is_no_news(linear):
 
 def test_gradient_clipping_bounds_the_step(linear):
     free = fdtasil.distill(linear, TOY, 2, **QUICK)
-    clipped = fdtasil.distill(linear, TOY, 2, **QUICK, max_gradient_norm=1e-9)
-    start = fdtasil.distill(linear, TOY, 2, **QUICK, learning_rate=0.0)
+    clipped, start = (
+        fdtasil.distill(linear, TOY, 2, **{**QUICK, "fit": Fit(steps=40, **change)})
+        for change in ({"max_gradient_norm": 1e-9}, {"learning_rate": 0.0})
+    )
     assert free.student.to_bytes() != clipped.student.to_bytes()
     assert start.history[-1]["loss"] > free.history[-1]["loss"]
 
 
 def test_callbacks_hear_of_everything(linear):
     heard = []
-    quick = {**QUICK, "episodes": 6, "steps": 200}
+    quick = {**QUICK, "episodes": 6, "fit": Fit(steps=200)}
     result = fdtasil.distill(linear, TOY, 2, trainer="dagger", callback=heard.append, **quick)
     kinds = [event.kind for event in heard]
     assert kinds == ["entry", "entry", "round"] * 3 + ["evaluation"]
@@ -87,8 +92,9 @@ def test_callbacks_hear_of_everything(linear):
 
 
 def test_logs_through_stable_baselines3(linear, tmp_path):
-    formats = ("csv", "json", "log", "tensorboard")
-    fdtasil.distill(linear, TOY, 2, **QUICK, out=tmp_path, log_formats=formats)
+    heard, log = [], fdtasil.Log(tmp_path / "log", "csv", "json", "log", "tensorboard")
+    result = fdtasil.distill(linear, TOY, 2, **QUICK, callback=[log, heard.append])
+    assert heard[-1].evaluation == result.evaluation
     rows = list(csv.DictReader((tmp_path / "log/progress.csv").open()))
     assert float(rows[0]["train/loss"]) > 0
     lines = [json.loads(line) for line in (tmp_path / "log/progress.json").open()]
@@ -96,15 +102,38 @@ def test_logs_through_stable_baselines3(linear, tmp_path):
     assert list((tmp_path / "log").glob("events.out.tfevents*"))
 
 
+@pytest.mark.parametrize("formats", [(), ("excel",), ("csv", "excel")])
+def test_a_log_of_no_known_format_is_refused(formats, tmp_path):
+    with pytest.raises(SettingError, match="log formats: (none|excel)"):
+        fdtasil.Log(tmp_path, *formats)
+
+
+def test_a_second_log_spares_the_first(linear, tmp_path):
+    """A logger begins its files anew."""
+    for _ in range(2):
+        fdtasil.distill(linear, TOY, 0, **QUICK, callback=fdtasil.Log(tmp_path / "log", "csv"))
+    assert {path.parent.name for path in tmp_path.rglob("progress.csv")} == {"log", "log-2"}
+
+
 @pytest.mark.parametrize(
     ("wrong", "found"),
     [
-        ({"log_formats": ("csv",)}, "without a folder"),
-        ({"log_formats": ("excel",), "out": "runs/x"}, "excel"),
         ({"validation": 1.0}, "validation=1.0"),
         ({"max_gradient_norm": 0.0}, "max_gradient_norm=0.0"),
         ({"order": 3}, "order=3"),
-        ({"order": 2, "probes": "sphere:3,forward"}, "forward stencil"),
+        ({"order": 0}, "order=0"),
+        ({"epochs": 3, "steps": 3}, "steps=3, epochs=3"),
+    ],
+)
+def test_a_wrong_setting_of_the_fit_is_named(wrong, found):
+    with pytest.raises(SettingError, match=found):
+        Fit(**wrong)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "found"),
+    [
+        ({"fit": Fit(order=2), "probes": "sphere:3,forward"}, "forward stencil"),
         ({"resume": "nowhere"}, "no run to resume"),
     ],
 )
@@ -112,6 +141,20 @@ def test_wrong_options_are_named(wrong, found, linear, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with pytest.raises(SettingError, match=found):
         fdtasil.distill(linear, TOY, **{"probes": 2, **QUICK, **wrong})
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_warning_names_the_callers_own_line(linear):
+    """Of whatever calls the library, however deep in it the warning is found."""
+    run = {**QUICK, "evaluation_episodes": 1}
+    with pytest.warns(FdtasilWarning, match="rounds away") as caught:
+        line = inspect.currentframe().f_lineno + 1
+        fdtasil.distill(linear, TOY, "sphere:2,radius=3e-7", **run)
+    assert {(one.filename, one.lineno) for one in caught} == {(__file__, line)}
+    with pytest.warns(FdtasilWarning, match="ends its episodes at 40 steps") as caught:
+        line = inspect.currentframe().f_lineno + 1
+        fdtasil.evaluate(linear, linear, TOY, episodes=2, horizon=50)
+    assert {(one.filename, one.lineno) for one in caught} == {(__file__, line)}
 
 
 @pytest.fixture
@@ -137,11 +180,9 @@ def test_minari_there_and_back(quick, minari_folder):
 def test_cloning_from_a_dataset_alone(quick, minari_folder):
     """No expert and no environment: the same student as plain cloning in the run itself."""
     fdtasil.to_minari(quick.dataset, "toy/alone-v0")
-    settings = {"hidden": QUICK["hidden"], "steps": QUICK["steps"]}
-    cloned = fdtasil.distill(
-        demonstrations=fdtasil.from_minari("toy/alone-v0"), probes=0, **settings
-    )
-    again = fdtasil.distill(demonstrations=quick.dataset, probes=0, **settings)
+    settings = {"student": QUICK["student"], "fit": QUICK["fit"]}
+    cloned = fdtasil.distill(dataset=fdtasil.from_minari("toy/alone-v0"), probes=0, **settings)
+    again = fdtasil.distill(dataset=quick.dataset, probes=0, **settings)
     rows = quick.demonstrations.observations
     assert np.array_equal(cloned.student.act(rows), again.student.act(rows))
     assert np.abs(cloned.student.act(rows)).max() <= 1

@@ -11,6 +11,7 @@ from toy_environments import Integrator
 
 import fdtasil
 from fdtasil.errors import SettingError, StorageError
+from fdtasil.run.presets import preset_of
 
 SPECS = [
     "none",
@@ -41,7 +42,7 @@ def test_every_source_gives_a_student_at_the_predicted_cost(spec, tmp_path):
 
 
 def test_the_student_becomes_the_expert(linear):
-    longer = {"steps": 800, "hidden": (64,), "episodes": 6}
+    longer = {"fit": fdtasil.Fit(steps=800), "student": fdtasil.Mlp(64), "episodes": 6}
     result = fdtasil.distill(linear, TOY, 4, **{**QUICK, **longer})
     assert result.evaluation.normalized_return == pytest.approx(1, abs=0.02)
     assert result.evaluation.action_error < 0.05
@@ -60,7 +61,7 @@ def test_same_seed_same_bytes(tmp_path):
     results = [fdtasil.distill(expert, TOY, 3, **QUICK, seed=s) for s in (5, 5, 6)]
     first, second, other = (r.student.to_bytes() for r in results)
     assert first == second != other
-    assert results[0].onnx_bytes() == results[1].onnx_bytes()
+    assert results[0].export_bytes("student.onnx") == results[1].export_bytes("student.onnx")
     assert results[0].evaluation == results[1].evaluation
     assert results[0].history == results[1].history
 
@@ -86,7 +87,7 @@ def test_a_run_folder_holds_everything_and_reads_back(quick, tmp_path):
     for name in ("evaluation", "history", "queries", "settings", "report"):
         assert getattr(again, name) == getattr(quick, name), name
     assert np.array_equal(again.answers.values, quick.answers.values)
-    assert again.onnx_bytes() == (folder / "student.onnx").read_bytes()
+    assert again.export_bytes("student.onnx") == (folder / "student.onnx").read_bytes()
 
 
 def test_the_report_has_what_it_promises(quick, tmp_path):
@@ -131,8 +132,8 @@ def test_the_budget_is_checked_before_anything_is_asked():
 
 
 def test_the_papers_preset(linear):
-    quick = {**QUICK, "steps": None}
-    result = fdtasil.distill(linear, TOY, 3, preset="paper", epochs=2, **quick)
+    quick = {**QUICK, "fit": preset_of("paper").fit_with(epochs=2)}
+    result = fdtasil.distill(linear, TOY, 3, preset="paper", **quick)
     assert result.report["probes"] == "sphere:3,forward,raw,radius=0.01,per_step=all"
     lengths = np.linalg.norm(result.answers.displacements, axis=1)
     assert np.allclose(lengths, 0.01)
@@ -140,9 +141,26 @@ def test_the_papers_preset(linear):
     assert result.settings["fit"]["epochs"] == 2
 
 
+def test_a_fit_that_is_left_out_is_the_presets(linear, monkeypatch):
+    given = []
+
+    def told(student, states, probes, answers, settings, *rest, **named):
+        given.append(settings)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("fdtasil.run.training.fit", told)
+    for preset in ("standard", "paper"):
+        run = {**QUICK, "fit": None, "preset": preset}
+        with pytest.raises(KeyboardInterrupt):
+            fdtasil.distill(linear, TOY, 2, **run)
+    assert given == [fdtasil.Fit(), preset_of("paper").fit]
+    assert preset_of("paper").fit.epochs == 4500
+
+
 def test_the_same_weight_means_the_same_for_every_number_of_probes(linear):
+    once = {**QUICK, "fit": fdtasil.Fit(steps=1)}
     errors = [
-        fdtasil.distill(linear, TOY, n, **{**QUICK, "steps": 1}).history[0]["derivative_error"]
+        fdtasil.distill(linear, TOY, n, **once).history[0]["derivative_error"]
         for n in (1, 10, "basis")
     ]
     assert max(errors) / min(errors) < 1.3
@@ -158,9 +176,8 @@ def test_the_same_weight_means_the_same_for_every_number_of_probes(linear):
         ({"horizon": 0}, "horizon=0"),
         ({"evaluation_episodes": -1}, "evaluation_episodes=-1"),
         ({"device": "tpu"}, "device='tpu'"),
-        ({"activation": "step"}, "activation='step'"),
         ({"probes": "spere:3"}, "spere:3"),
-        ({"steps": 0}, "steps=0"),
+        ({"max_queries": -1}, "max_queries=-1"),
     ],
 )
 def test_a_wrong_argument_is_named_at_once(wrong, found):
@@ -169,6 +186,22 @@ def test_a_wrong_argument_is_named_at_once(wrong, found):
 
     with pytest.raises(SettingError, match=found) as error:
         fdtasil.distill(never, TOY, **{"probes": 1, **QUICK, **wrong})
+    assert len(str(error.value).splitlines()) <= 6
+
+
+@pytest.mark.parametrize(
+    ("make", "found"),
+    [
+        (lambda: fdtasil.Mlp(activation="step"), "activation='step'"),
+        (lambda: fdtasil.Mlp((8, 0)), "hidden=0"),
+        (lambda: fdtasil.Mlp("16"), "hidden='16'"),
+        (lambda: fdtasil.Fit(steps=0), "steps=0"),
+        (lambda: fdtasil.Fit(weight=-1), "weight=-1"),
+    ],
+)
+def test_a_wrong_setting_of_an_object_is_named_where_it_is_made(make, found):
+    with pytest.raises(SettingError, match=found) as error:
+        make()
     assert len(str(error.value).splitlines()) <= 6
 
 
@@ -252,8 +285,12 @@ def test_the_prediction_keeps_the_ladder_that_was_asked(linear):
 
 
 def test_numbers_of_numpy_are_as_good_as_python_s(linear, tmp_path):
-    given = {"steps": np.int64(5), "hidden": np.int64(8), "weight": np.float32(0.5)}
-    plain = {"steps": 5, "hidden": 8, "weight": 0.5}
+    given = {
+        "student": fdtasil.Mlp(np.int64(8)),
+        "fit": fdtasil.Fit(steps=np.int64(5), weight=np.float32(0.5)),
+        "episodes": np.int64(2),
+    }
+    plain = {"student": fdtasil.Mlp(8), "fit": fdtasil.Fit(steps=5, weight=0.5), "episodes": 2}
     ours, theirs = (
         fdtasil.distill(linear, TOY, 2, **{**QUICK, **numbers}).save(tmp_path / name)
         for name, numbers in (("numpy", given), ("python", plain))

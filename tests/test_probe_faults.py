@@ -52,11 +52,18 @@ def test_a_number_that_is_none_is_refused_before_anything_is_asked(probes):
 
 
 @pytest.mark.fault(84)
-@pytest.mark.parametrize("probes", [0, "0", "none", None])
+@pytest.mark.parametrize("probes", [0, "0", "none"])
 def test_no_probes_are_plain_cloning_and_say_so(probes, linear):
     result = fdtasil.distill(linear, TOY, probes, **QUICK)
     assert result.report["probes"] == "none"
     assert result.queries["probe"] == 0
+
+
+def test_probes_that_are_left_out_are_ten(linear):
+    for left_out in ({}, {"probes": None}):
+        result = fdtasil.distill(linear, TOY, **left_out, **QUICK)
+        assert result.report["probes"].startswith("adaptive:10,")
+        assert result.queries["probe"] == 400
 
 
 @pytest.mark.fault(84)
@@ -263,8 +270,8 @@ def test_probes_are_not_clipped_to_the_bounds_of_the_observations(linear):
 
 
 @pytest.mark.fault(93)
-def test_an_expert_that_refuses_what_lies_outside_is_told_why_before_training(linear, monkeypatch):
-    monkeypatch.setattr("fdtasil.run.training.fit", never)
+@pytest.mark.usefixtures("nothing_is_trained")
+def test_an_expert_that_refuses_what_lies_outside_is_told_why_before_training(linear):
 
     def strict(rows):
         if np.abs(rows[:, :4]).max() > 1.2:

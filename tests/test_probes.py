@@ -9,7 +9,7 @@ from fdtasil.probes.directions import OrthogonalFrames, RandomSphere
 from fdtasil.probes.source import DIRECTIONS, Probes
 from fdtasil.probes.stencils import CENTRAL, FORWARD
 
-COUNTS = {"basis": None, "jacobian": None}
+WITHOUT_COUNT = ("basis", "jacobian")
 
 
 def states(dimension, physical=None):
@@ -41,7 +41,7 @@ def test_few_states_say_nothing_of_redundant_directions():
 @pytest.mark.parametrize("rows", [1, 40])
 @pytest.mark.parametrize("design", DIRECTIONS)
 def test_every_design_keeps_the_contract(design, rows, dimension):
-    directions = DIRECTIONS[design](COUNTS.get(design, 7))
+    directions = DIRECTIONS[design].parse(None if design in WITHOUT_COUNT else "7")
     bank, numbers = directions.draw(rows, states(dimension), np.random.default_rng(0))
     assert bank.shape[1] == dimension
     assert numbers.shape == (rows, directions.count(dimension))
@@ -57,7 +57,7 @@ def test_every_design_keeps_the_contract(design, rows, dimension):
 def test_the_mean_square_of_a_derivative_is_the_jacobians(design):
     """E over directions of d |J u|^2 is |J|_F^2: what makes one weight fit every design."""
     jacobian = np.random.default_rng(1).standard_normal((3, 6))
-    directions = DIRECTIONS[design](COUNTS.get(design, 12))
+    directions = DIRECTIONS[design].parse(None if design in WITHOUT_COUNT else "12")
     bank, numbers = directions.draw(600, states(6), np.random.default_rng(0))
     squares = 6 * ((bank[numbers] @ jacobian.T) ** 2).sum(axis=-1)
     assert squares.mean() == pytest.approx((jacobian**2).sum(), rel=0.05)
@@ -112,6 +112,8 @@ def test_short_specs():
     assert Probes.parse(0) is None
     assert Probes.parse("none") is None
     assert Probes.parse(10) == Probes.parse("10") == Probes.parse("adaptive:10")
+    assert Probes.parse("10,central") == Probes.parse("adaptive:10,central")
+    assert Probes.parse("sphere") == Probes.parse("sphere:10")
 
 
 @pytest.mark.fault(84, 86)

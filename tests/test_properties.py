@@ -16,14 +16,15 @@ from fdtasil.experts.load import load_expert
 from fdtasil.files.storage import sha256, verify, write_folder
 from fdtasil.probes.answers import Answers, ask_probes
 from fdtasil.probes.calibration import Calibration, Ladder, calibrate
-from fdtasil.probes.directions import OrthogonalFrames
+from fdtasil.probes.directions import Jacobian, OrthogonalFrames
 from fdtasil.probes.scales import measure_scales
 from fdtasil.probes.source import DIRECTIONS, Probes
 from fdtasil.probes.stencils import CENTRAL, EXACT, FORWARD, LABELS
 from fdtasil.run.presets import PRESETS
 from fdtasil.seeding import torch_generator
+from fdtasil.student.architectures import ACTIVATIONS, Mlp
 from fdtasil.student.fit_state import FitState
-from fdtasil.student.network import ACTIVATIONS, Student, StudentShape
+from fdtasil.student.policy import Student
 
 
 def few(examples):
@@ -125,7 +126,7 @@ def test_the_size_of_a_chunk_changes_no_byte(kind, rows, chunk, seed, asked_in_c
 def test_probes_are_never_fewer_than_asked_for(design, rows, dimension, count, moving, seed):
     """Also more of them than coordinates, and where observations are functions of few things."""
     fixed = design in ("basis", "jacobian")
-    directions = DIRECTIONS[design](None if fixed else count)
+    directions = DIRECTIONS[design].parse(None if fixed else str(count))
     moving = min(moving, dimension)
     states = random_array(seed, (60, moving)) @ random_array(seed + 1, (moving, dimension))
     bank, numbers = directions.draw(rows, states, np.random.default_rng(seed))
@@ -141,42 +142,42 @@ def test_probes_are_never_fewer_than_asked_for(design, rows, dimension, count, m
 # --- files
 
 
-shapes = st.builds(
-    StudentShape,
-    st.integers(1, 9),
-    st.integers(1, 4),
+networks = st.builds(
+    Mlp,
     st.lists(st.integers(1, 9), max_size=3).map(tuple),
     st.sampled_from(sorted(ACTIVATIONS)),
 )
+sizes = st.tuples(st.integers(1, 9), st.integers(1, 4))
 limits = st.one_of(st.just(np.inf), st.floats(0.1, 1e6))
 
 
-def student_of(shape, seed, limit):
-    m = shape.action_size
-    mean, scale = random_array(seed, shape.observation_size), np.ones(shape.observation_size)
-    low, high = np.full(m, -limit), np.full(m, limit)
-    return Student(shape, mean, scale, low, high, torch_generator(seed)).eval()
+def student_of(network, sizes, seed, limit):
+    n, m = sizes
+    bounds = np.full(m, -limit), np.full(m, limit)
+    student = Student(network, random_array(seed, n), np.ones(n), *bounds, torch_generator(seed))
+    return student.eval()
 
 
 @few(20)
-@given(shape=shapes, seed=seeds, limit=limits, note=st.text())
-def test_a_student_reads_back(shape, seed, limit, note):
-    student = student_of(shape, seed, limit)
+@given(network=networks, sizes=sizes, seed=seeds, limit=limits, note=st.text())
+def test_a_student_reads_back(network, sizes, seed, limit, note):
+    student = student_of(network, sizes, seed, limit)
     data = student.to_bytes({"note": note})
     again = Student.from_bytes(data)
-    assert again.shape == shape
+    assert again.architecture == network
+    assert (again.observation_size, again.action_size) == sizes
     assert again.to_bytes({"note": note}) == data
-    rows = random_array(seed, (5, shape.observation_size))
+    rows = random_array(seed, (5, sizes[0]))
     assert np.array_equal(again.act(rows), student.act(rows))
 
 
 @few(20)
-@given(shape=shapes, seed=seeds, steps=st.integers(0, 5), logged=st.booleans())
-def test_the_state_of_a_training_reads_back(shape, seed, steps, logged):
+@given(network=networks, sizes=sizes, seed=seeds, steps=st.integers(0, 5), logged=st.booleans())
+def test_the_state_of_a_training_reads_back(network, sizes, seed, steps, logged):
     def begun():
-        student = student_of(shape, seed, 1.0)
+        student = student_of(network, sizes, seed, 1.0)
         optimiser = torch.optim.AdamW(student.parameters())
-        rows = torch.from_numpy(random_array(seed, (4, shape.observation_size)))
+        rows = torch.from_numpy(random_array(seed, (4, sizes[0])))
         state = FitState(student, optimiser)
 
         def go_on():
@@ -208,7 +209,7 @@ directions = st.one_of(
     st.builds(DIRECTIONS["adaptive"], counts),
     st.builds(DIRECTIONS["sphere"], counts),
     st.builds(DIRECTIONS["orthogonal"], counts),
-    st.just(DIRECTIONS["basis"](None)),
+    st.just(DIRECTIONS["basis"]()),
     st.just(OrthogonalFrames()),
 )
 radii = st.none() | st.floats(0, exclude_min=True, allow_infinity=False, allow_nan=False)
@@ -220,7 +221,7 @@ sources = st.builds(
     space=st.sampled_from([None, "whitened", "raw"]),
     resample=st.booleans(),
     per_step=st.none() | st.just("all") | counts,
-) | st.builds(Probes, st.just(OrthogonalFrames()), st.just(EXACT), radius=radii)
+) | st.builds(Probes, st.just(Jacobian()), st.just(EXACT) | st.none(), radius=radii)
 
 
 @few(200)

@@ -9,6 +9,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from conftest import QUICK
 from sb3_agents import (
     ALGORITHMS,
     SHAPES,
@@ -198,7 +199,7 @@ def test_an_agent_in_memory_is_not_a_zip(tmp_path):
 def test_distill_takes_the_zip(save):
     agent = make_agent("SAC")
     source = save(agent)
-    options = {"episodes": 1, "horizon": 20, "steps": 20, "hidden": (8,), "evaluation_episodes": 2}
+    options = {**QUICK, "episodes": 1}
     result = fdtasil.distill(source, "Pendulum-v1", 2, **options)
     states = result.demonstrations.observations
     assert np.abs(result.demonstrations.actions - predict(agent, states)).max() <= 1e-5

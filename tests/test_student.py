@@ -9,13 +9,14 @@ import torch
 from fdtasil.errors import ExportError, SettingError, StorageError
 from fdtasil.files.onnx.export import export_module
 from fdtasil.seeding import torch_generator
-from fdtasil.student.network import ACTIVATIONS, Student, StudentShape
+from fdtasil.student.architectures import ACTIVATIONS, Mlp
+from fdtasil.student.policy import Student
 
 
 def make(hidden=(16, 8), activation="gelu", low=(-2.0, -1.0), high=(2.0, 3.0), seed=0):
     mean, scale = np.array([5.0, 0, 0]), np.array([2.0, 1, 1])
-    shape = StudentShape(3, 2, hidden, activation)
-    return Student(shape, mean, scale, np.array(low), np.array(high), torch_generator(seed))
+    bounds = np.array(low), np.array(high)
+    return Student(Mlp(hidden, activation), mean, scale, *bounds, torch_generator(seed))
 
 
 @pytest.fixture
@@ -71,9 +72,8 @@ def test_stable_baselines3_evaluates_it():
     from stable_baselines3.common.env_util import make_vec_env
     from stable_baselines3.common.evaluation import evaluate_policy
 
-    shape = StudentShape(3, 1, (8,), "tanh")
-    pendulum = np.array([2.0])
-    student = Student(shape, np.zeros(3), np.ones(3), -pendulum, pendulum, torch_generator(0))
+    network, bound = Mlp(8, "tanh"), np.array([2.0])
+    student = Student(network, np.zeros(3), np.ones(3), -bound, bound, torch_generator(0))
     environment = make_vec_env("Pendulum-v1", 2, seed=0)
     mean, deviation = evaluate_policy(student, environment, n_eval_episodes=2, warn=False)
     assert np.isfinite(mean)
@@ -90,7 +90,8 @@ def test_equal_seeds_give_equal_bytes_and_they_read_back(rows):
     assert first.to_bytes() == second.to_bytes()
     assert first.to_bytes() != other.to_bytes()
     again = Student.from_bytes(first.to_bytes({"note": "kept"}))
-    assert again.shape == first.shape
+    assert again.architecture == first.architecture == Mlp((16, 8), "gelu")
+    assert (again.observation_size, again.action_size) == (3, 2)
     assert np.array_equal(again.act(rows), first.act(rows))
 
 

@@ -109,7 +109,7 @@ def test_one_state_can_be_learnt(horizon, trainer, linear):
     result = fdtasil.distill(linear, TOY, 3, **{**run, "episodes": 1 if trainer == "bc" else 2})
     assert np.isfinite([list(entry.values()) for entry in result.history]).all()
     assert all(torch.isfinite(weights).all() for weights in result.student.parameters())
-    assert len(result.onnx_bytes()) > 100
+    assert len(result.export_bytes("student.onnx")) > 100
 
 
 @pytest.mark.fault(97)

@@ -11,7 +11,8 @@ from fdtasil.probes.scales import measure_scales
 from fdtasil.probes.source import Probes
 from fdtasil.run.presets import PRESETS
 from fdtasil.seeding import torch_generator
-from fdtasil.student.network import Student, StudentShape
+from fdtasil.student.architectures import Mlp
+from fdtasil.student.policy import Student
 
 
 def linear_task(states=200, n=6, m=2, spec=None):
@@ -30,8 +31,8 @@ def linear_task(states=200, n=6, m=2, spec=None):
     )
     scales = measure_scales(observations)
 
-    def ask(pool):
-        return ask_probes(expert, observations, probes, scales, np.random.default_rng(pool))
+    def ask(sample):
+        return ask_probes(expert, observations, probes, scales, np.random.default_rng(sample))
 
     return demonstrations, probes, ask
 
@@ -40,7 +41,6 @@ def stream(name):
     return torch_generator(0, name)
 
 
-def new_student(n=6, m=2, hidden=(32,)):
+def new_student(n=6, m=2, hidden=32):
     zeros, ones, bound = np.zeros(n), np.ones(n), np.full(m, 3.0)
-    shape = StudentShape(n, m, hidden, "gelu")
-    return Student(shape, zeros, ones, -bound, bound, torch_generator(0))
+    return Student(Mlp(hidden), zeros, ones, -bound, bound, torch_generator(0))
