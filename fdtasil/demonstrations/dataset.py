@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from fdtasil.demonstrations.states import Demonstrations
-from fdtasil.errors import SettingError, StorageError
+from fdtasil.errors import SettingError, StorageError, first_line
 from fdtasil.files.storage import is_written, verify
 from fdtasil.probes.answers import Answers
 from fdtasil.probes.source import Probes
@@ -22,7 +22,7 @@ _VERSION = 1
 
 @dataclass(frozen=True)
 class Dataset:
-    """Everything that a student can be trained from without one new question.
+    """Everything that a student can be trained from without one new query.
 
     Attributes:
         demonstrations: The labelled states.
@@ -82,7 +82,7 @@ class Dataset:
                 return _read(dict(arrays))
         except (KeyError, TypeError, ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
             raise StorageError(
-                f"not demonstrations: {type(error).__name__} {error}".splitlines()[0],
+                f"not demonstrations: {type(error).__name__} {first_line(error)}",
                 "a demonstrations.npz written by fdtasil",
                 "check the path, or save again",
             ) from error

@@ -8,7 +8,7 @@ import numpy as np
 
 from fdtasil.demonstrations.dataset import Dataset
 from fdtasil.demonstrations.states import Demonstrations
-from fdtasil.errors import SettingError, StorageError
+from fdtasil.errors import SettingError, StorageError, first_line
 
 if TYPE_CHECKING:
     import minari
@@ -109,7 +109,7 @@ def to_minari(dataset: Dataset, dataset_id: str, **about: str) -> "minari.Minari
         )
     except (OSError, ValueError, AssertionError) as error:
         raise StorageError(
-            f"Minari can't write {dataset_id!r}: {error}".splitlines()[0],
+            f"Minari can't write {dataset_id!r}: {first_line(error)}",
             "a new id such as cheetah/sac-v0",
             f"choose another id, or `minari delete {dataset_id}`",
         ) from error

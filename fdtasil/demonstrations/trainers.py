@@ -2,11 +2,12 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from numbers import Real
+from itertools import pairwise
 from typing import Literal, Protocol
 
 import numpy as np
 
+from fdtasil.checks import check_count, check_share
 from fdtasil.errors import SettingError
 from fdtasil.experts.expert import Expert
 from fdtasil.rollouts.behaviours import Behaviour, Decision, Policy
@@ -109,11 +110,11 @@ class DAgger:
         if self.mix not in ("blend", "switch"):
             raise SettingError(f"mix={self.mix!r}", '"blend" or "switch"', "choose one of these")
         if not callable(self.beta):
-            _check_share(self.beta)
+            check_share("beta", self.beta)
 
     def share(self, round_: int) -> float:
         """Return the expert's share in a round."""
-        return _check_share(self.beta(round_) if callable(self.beta) else self.beta**round_)
+        return check_share("beta", self.beta(round_) if callable(self.beta) else self.beta**round_)
 
     def rounds(self, episodes: int) -> list[int]:
         """The episodes between two updates; the last round ends with the budget."""
@@ -167,8 +168,7 @@ class Dart:
         _check_updates(self.updates)
         if not 0 <= self.alpha < float("inf"):
             raise SettingError(f"alpha={self.alpha!r}", "a number of at least 0", "write alpha=0")
-        if isinstance(self.extra, bool) or not isinstance(self.extra, int) or self.extra < 1:
-            raise SettingError(f"extra={self.extra!r}", "a positive integer", "write extra=5")
+        object.__setattr__(self, "extra", check_count("extra", self.extra))
 
     def rounds(self, episodes: int) -> list[int]:
         """The episodes between two updates; the last round ends with the budget."""
@@ -233,19 +233,13 @@ def _between(updates: Sequence[int], episodes: int) -> list[int]:
 
 
 def _check_updates(updates: Sequence[int]) -> None:
-    ascending = all(a < b for a, b in zip([0, *updates], updates, strict=False))
-    if not ascending or not all(isinstance(update, int) for update in updates):
+    numbers = [check_count("updates", update) for update in updates]
+    if not all(a < b for a, b in pairwise([0, *numbers])):
         raise SettingError(
             f"updates={updates!r}",
             "increasing numbers of episodes",
             "write updates=(1, 5, 20, 30)",
         )
-
-
-def _check_share(share: float) -> float:
-    if not isinstance(share, Real) or not 0 <= share <= 1:
-        raise SettingError(f"beta gives {share!r}", "a share from 0 to 1", "write beta=0.5")
-    return share
 
 
 TRAINERS: dict[str, Callable[[], Trainer]] = {

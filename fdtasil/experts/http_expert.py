@@ -34,7 +34,7 @@ def is_http_url(source: object) -> TypeGuard[str]:
 
 
 def open_http(url: str, action_size: int | None = None, timeout: float | None = None) -> Expert:
-    """Ask an expert behind HTTP; nothing is sent before the first question.
+    """Ask an expert behind HTTP; nothing is sent before the first query.
 
     A batch is one `POST {"observations": [[...], ...]}`, answered by `{"actions": [[...], ...]}`;
     float32 numbers survive JSON exactly. Each thread keeps a connection of its own. Connections

@@ -76,8 +76,8 @@ def write_folder(folder: Path, files: Mapping[str, bytes]) -> None:
         raise explain(error, coming, "a folder that can be removed") from error
     for name, data in files.items():
         _write(coming / name, data)
-    for place in {(coming / name).parent for name in files}:
-        _flush_names(place)
+    for inner in {(coming / name).parent for name in files}:
+        _flush_names(inner)
     manifest = {name: sha256(data) for name, data in sorted(files.items())}
     write_bytes(coming / MANIFEST, to_json(manifest))
     _move_in(folder)
@@ -108,7 +108,7 @@ def verify(folder: Path, names: Collection[str] | None = None) -> dict[str, byte
         StorageError: If the manifest or a file is missing, or a file is not the one written.
     """
     try:
-        listed = _place(folder, MANIFEST).read_bytes()
+        listed = _path_of(folder, MANIFEST).read_bytes()
         manifest = json.loads(listed)
         # Nothing but what we write: a manifest that was changed must not pass for a shorter one.
         if to_json(manifest) != listed or not isinstance(manifest, dict):
@@ -118,7 +118,7 @@ def verify(folder: Path, names: Collection[str] | None = None) -> dict[str, byte
         wanted = manifest if names is None else names
         if missing := set(wanted) - manifest.keys():
             raise ValueError(f"{MANIFEST} does not name {', '.join(sorted(missing))}")
-        files = {name: _place(folder, name).read_bytes() for name in wanted}
+        files = {name: _path_of(folder, name).read_bytes() for name in wanted}
     except (OSError, ValueError) as error:
         raise StorageError(
             f"{folder}: {error}", "a folder written by save()", "check the path, or save again"
@@ -135,7 +135,7 @@ def verify(folder: Path, names: Collection[str] | None = None) -> dict[str, byte
 
 def is_written(folder: Path) -> bool:
     """Return whether a folder has a manifest: everything else was there before it."""
-    return _place(folder, MANIFEST).exists()
+    return _path_of(folder, MANIFEST).exists()
 
 
 def stays_inside(name: str) -> bool:
@@ -167,7 +167,7 @@ def _write(path: Path, data: bytes) -> None:
         raise explain(error, path, f"room and permission for {len(data):,} bytes") from error
 
 
-def _place(folder: Path, name: str) -> Path:
+def _path_of(folder: Path, name: str) -> Path:
     """Return where a file of a folder is, which is not yet in place if a move was cut short."""
     coming = folder / _COMING
     early = coming / name

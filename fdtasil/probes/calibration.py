@@ -8,6 +8,7 @@ import numpy as np
 
 from fdtasil.errors import warn
 from fdtasil.experts.expert import Expert
+from fdtasil.files.plain import from_plain, to_plain
 from fdtasil.probes.answers import ask_moved
 from fdtasil.probes.scales import Scales
 from fdtasil.probes.source import Probes
@@ -99,15 +100,13 @@ class Calibration:
 
     def to_json(self) -> dict[str, Any]:
         """Return the calibration as plain JSON values."""
-        plain = {name: list(v) if isinstance(v, tuple) else v for name, v in vars(self).items()}
-        return plain | {"similarity": [None, *self.similarity[1:]]}
+        return to_plain(self) | {"similarity": [None, *self.similarity[1:]]}
 
     @classmethod
     def from_json(cls, fields: Mapping[str, Any]) -> "Calibration":
         """Read what `to_json` returned."""
-        lists = {name: tuple(value) for name, value in fields.items() if isinstance(value, list)}
-        similarity = (float("nan"), *fields["similarity"][1:])
-        return cls(**{**fields, **lists, "similarity": similarity})
+        similarity = [float("nan"), *fields["similarity"][1:]]
+        return from_plain(cls, {**fields, "similarity": similarity})
 
     def _warn_of(self, radius: float) -> None:
         change = float(np.interp(np.log(radius), np.log(self.radii), self.change))

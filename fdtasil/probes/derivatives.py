@@ -42,14 +42,14 @@ def differentiate(
             "a torch module, or an ONNX file made of the operators of an MLP",
             'probe it instead: probes="basis" or probes=10',
         )
-    place = next(module.parameters(), torch.zeros(()))
+    like = next(module.parameters(), torch.zeros(()))
     along = torch.func.vmap(_derivatives_along(module, order), in_dims=(None, 0))
     every = torch.func.vmap(along)
     parts = []
     for start in range(0, len(observations), _STATES):
         rows = slice(start, start + _STATES)
-        states = torch.from_numpy(observations[rows]).to(place.device, place.dtype)
-        moved = torch.from_numpy(directions[numbers[rows]]).to(place.device, place.dtype)
+        states = torch.from_numpy(observations[rows]).to(like.device, like.dtype)
+        moved = torch.from_numpy(directions[numbers[rows]]).to(like.device, like.dtype)
         with torch.no_grad():
             parts.append(every(states, moved).float().cpu().numpy())
     return np.concatenate(parts)

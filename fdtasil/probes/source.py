@@ -4,8 +4,6 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-import numpy as np
-
 from fdtasil.checks import check_count, check_number
 from fdtasil.errors import SettingError
 from fdtasil.probes.adaptive import AdaptiveDirections
@@ -33,8 +31,8 @@ class Probes:
 
     Attributes:
         directions: Where.
-        stencil: How: `FORWARD`, `CENTRAL`, `LABELS` (no difference: augmentation, the rival that
-            benchmarks compare with), or `EXACT` (a differentiable expert only). None
+        stencil: How: `FORWARD`, `CENTRAL`, `LABELS` (no difference: augmentation, the
+            baseline that benchmarks compare with), or `EXACT` (a differentiable expert only). None
             leaves it to the calibration, or is forward for first order and central for second.
         radius: How far. Whitened space: standard deviations moved by each coordinate that moves
             (root mean square). Raw space: Euclidean length of the displacement.
@@ -101,9 +99,11 @@ class Probes:
             if spec.isdigit():
                 return Probes.parse(int(spec))
             return None if spec == "none" else _parse_text(spec)
-        if isinstance(spec, bool) or not isinstance(spec, (int, np.integer)) or spec < 0:
-            raise SettingError(f"probes={spec!r}", _GRAMMAR, _EXAMPLES)
-        return Probes(AdaptiveDirections(int(spec))) if spec else None
+        try:
+            count = check_count("probes", spec, least=0)
+        except SettingError:
+            raise SettingError(f"probes={spec!r}", _GRAMMAR, _EXAMPLES) from None
+        return Probes(AdaptiveDirections(count)) if count else None
 
     def describe(self) -> str:
         """Return the text that `parse` reads back, with the radius where it is set."""

@@ -8,6 +8,7 @@ import numpy as np
 
 from fdtasil.errors import warn
 from fdtasil.experts.expert import Expert
+from fdtasil.files.plain import from_plain, to_plain
 from fdtasil.progress import Progress
 from fdtasil.rollouts.behaviours import Policy, follow, random_behaviour
 from fdtasil.rollouts.environments import EnvironmentPool
@@ -67,16 +68,12 @@ class Evaluation:
 
     def to_json(self) -> dict[str, Any]:
         """Return the evaluation as plain JSON values."""
-        return {
-            name: list(value) if isinstance(value, tuple) else value
-            for name, value in vars(self).items()
-        }
+        return to_plain(self)
 
     @classmethod
     def from_json(cls, fields: Mapping[str, Any]) -> "Evaluation":
         """Read what `to_json` returned."""
-        lists = {name: tuple(value) for name, value in fields.items() if isinstance(value, list)}
-        return cls(**{**fields, **lists})
+        return from_plain(cls, fields)
 
     def __str__(self) -> str:
         expert = f"{self.expert_return:10.1f}   survival {self.expert_survival:.2f}"

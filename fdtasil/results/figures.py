@@ -42,14 +42,14 @@ def draw_returns(evaluation: Evaluation) -> bytes:
     figure = _figure(7.0, 3.2)
     panel = figure.subplots()
     order = sorted(range(evaluation.episodes), key=lambda e: evaluation.expert_returns[e])
-    places = range(1, evaluation.episodes + 1)
-    for place, episode in zip(places, order, strict=True):
+    ranks = range(1, evaluation.episodes + 1)
+    for rank, episode in zip(ranks, order, strict=True):
         ends = evaluation.expert_returns[episode], evaluation.student_returns[episode]
-        panel.plot([place, place], ends, color="#bbbbbb", linewidth=1, zorder=1)
+        panel.plot([rank, rank], ends, color="#bbbbbb", linewidth=1, zorder=1)
     expert = [evaluation.expert_returns[e] for e in order]
     student = [evaluation.student_returns[e] for e in order]
-    panel.scatter(places, expert, marker="s", s=22, color=_EXPERT, label="expert", zorder=2)
-    panel.scatter(places, student, marker="o", s=26, color=_STUDENT, label="student", zorder=3)
+    panel.scatter(ranks, expert, marker="s", s=22, color=_EXPERT, label="expert", zorder=2)
+    panel.scatter(ranks, student, marker="o", s=26, color=_STUDENT, label="student", zorder=3)
     panel.set_title(
         f"normalised return {score_text(evaluation.normalized_return)}, "
         f"95 % {interval_text(evaluation.ci95)}, "

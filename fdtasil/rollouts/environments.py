@@ -4,13 +4,13 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from numbers import Integral
 from types import TracebackType
 
 import gymnasium
 import numpy as np
 
-from fdtasil.errors import EnvironmentFault, SettingError, warn
+from fdtasil.checks import check_count
+from fdtasil.errors import EnvironmentFault, SettingError, first_line, warn
 
 __all__ = ["EnvironmentLike", "EnvironmentPool", "resolve_horizon", "simulator_warnings"]
 
@@ -101,9 +101,8 @@ class EnvironmentPool:
             with simulator_warnings():
                 made = self._make()
         except Exception as error:  # a factory is the caller's code and may raise anything
-            first_line = (str(error).splitlines() or [type(error).__name__])[0]
             raise EnvironmentFault(
-                f"the environment can't be made: {first_line}",
+                f"the environment can't be made: {first_line(error)}",
                 "a gymnasium id, an environment, or a function without arguments that makes one",
                 self._advice,
             ) from error
@@ -123,19 +122,18 @@ def resolve_horizon(horizon: int | None, pool: EnvironmentPool) -> int:
         SettingError: If it is not a positive integer, or neither the caller nor the environment
             sets one.
     """
-    if horizon is None:
-        horizon = pool.time_limit
-    if isinstance(horizon, bool) or not isinstance(horizon, Integral) or horizon < 1:
+    limit = pool.time_limit
+    if horizon is None and limit is None:
         raise SettingError(
-            f"horizon={horizon!r} for {pool.name}",
-            "a positive number of steps, or an environment with a time limit of its own",
+            f"no horizon for {pool.name}, which has no time limit of its own",
+            "a positive number of steps",
             "write for example horizon=300",
         )
-    limit = pool.time_limit
-    if limit is not None and horizon > limit:
-        warn(f"horizon={horizon}: {pool.name} ends its episodes at {limit} steps, which is used")
+    steps = check_count("horizon", limit if horizon is None else horizon)
+    if limit is not None and steps > limit:
+        warn(f"horizon={steps}: {pool.name} ends its episodes at {limit} steps, which is used")
         return limit
-    return int(horizon)
+    return steps
 
 
 @contextmanager

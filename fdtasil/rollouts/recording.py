@@ -5,7 +5,7 @@ from collections.abc import Sequence
 import gymnasium
 import numpy as np
 
-from fdtasil.errors import EnvironmentFault, warn
+from fdtasil.errors import EnvironmentFault, first_line, warn
 from fdtasil.rollouts.behaviours import Decision
 from fdtasil.rollouts.environments import EnvironmentPool
 from fdtasil.rollouts.episodes import Episodes
@@ -116,7 +116,7 @@ class Recording:
         if decision.action.shape == expected and not np.isfinite(decision.action).all():
             row = int((~np.isfinite(decision.action).all(axis=1)).argmax())
             raise EnvironmentFault(
-                f"{self._place(alive[row], step)}: the policy's action is not finite",
+                f"{self._where(alive[row], step)}: the policy's action is not finite",
                 f"{expected[1]} finite numbers",
                 "check the policy's weights, and its answer to the observations of that episode",
             )
@@ -157,7 +157,7 @@ class Recording:
             self.physics_resets,
         )
 
-    def _place(self, episode: int, step: int | None) -> str:
+    def _where(self, episode: int, step: int | None) -> str:
         when = "" if step is None else f", step {step}"
         return f"{self._name}, episode {episode} (seed {self._seeds[episode]}){when}"
 
@@ -165,7 +165,7 @@ class Recording:
         self, episode: int, step: int | None, problem: str, expected: str
     ) -> EnvironmentFault:
         return EnvironmentFault(
-            f"{self._place(episode, step)}: {problem}",
+            f"{self._where(episode, step)}: {problem}",
             expected,
             "mend the environment, or end the episode before it diverges",
         )
@@ -173,9 +173,9 @@ class Recording:
     def _crash(
         self, episode: int, step: int | None, call: str, error: Exception
     ) -> EnvironmentFault:
-        first_line = (str(error).splitlines() or [""])[0][:200]
+        said = f"{call} raised {type(error).__name__}: {first_line(error)}"
         return EnvironmentFault(
-            f"{self._place(episode, step)}: {call} raised {type(error).__name__}: {first_line}",
+            f"{self._where(episode, step)}: {said}",
             "an environment that runs without raising",
             "run it on its own from that seed, and mend it",
         )

@@ -110,9 +110,9 @@ class RunFolder:
         config = self._path / _CHECKPOINTS / _CONFIG
         if not config.exists():
             write_bytes(config, to_json(self._config))
-        place = self._path / _CHECKPOINTS / str(round_)
-        write_folder(place / f"{stage}-{number}", files())
-        for older in _numbered(place, stage):
+        stages = self._path / _CHECKPOINTS / str(round_)
+        write_folder(stages / f"{stage}-{number}", files())
+        for older in _numbered(stages, stage):
             if older.name != f"{stage}-{number}":
                 shutil.rmtree(older, ignore_errors=True)
         self._saved = time.monotonic()
@@ -180,7 +180,7 @@ def _differences(before: Any, now: Any, name: str = "") -> list[str]:
     return [] if before == now else [f"{name} was {before!r}, is {now!r}"]
 
 
-def _numbered(place: Path, stage: str) -> list[Path]:
+def _numbered(stages: Path, stage: str) -> list[Path]:
     """Return the folders of a stage, the newest first."""
-    found = [folder for folder in place.glob(f"{stage}-*") if folder.name[-1].isdigit()]
+    found = [folder for folder in stages.glob(f"{stage}-*") if folder.name[-1].isdigit()]
     return sorted(found, key=lambda folder: -int(folder.name.rpartition("-")[2]))

@@ -3,17 +3,16 @@
 huggingface_hub is imported inside the functions: it is an extra, and `import fdtasil` stays light.
 """
 
-import fnmatch
 import hashlib
 import os
-from collections.abc import Collection
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
 
 from fdtasil.errors import ExpertError, first_line
-from fdtasil.experts.hub.place import COMMIT, Place, is_hub_uri, parse
 from fdtasil.experts.hub.requests import download, look_up, no_file
+from fdtasil.experts.hub.uri import COMMIT, HubUri, is_hub_uri, parse
+from fdtasil.experts.sb3.statistics import statistics_beside
 from fdtasil.files.onnx.model import side_files
 from fdtasil.files.storage import sha256, stays_inside, write_bytes
 
@@ -58,15 +57,15 @@ def fetch(uri: str | Path) -> HubFile:
         walker = fetch("hf://org/repo/walker.onnx")
         print(walker.uri)  # hf://org/repo/walker.onnx@<commit>
     """
-    place = parse(str(uri))
+    named = parse(str(uri))
     _check_library()
-    if not COMMIT.fullmatch(place.revision or ""):
-        place, _ = look_up(place)
-    path = _stored(place)
+    if not COMMIT.fullmatch(named.revision or ""):
+        named, _ = look_up(named)
+    path = _stored(named)
     for name in _declared(path):
-        file = str(PurePosixPath(place.file).parent / name)
-        _stored(replace(place, file=file))
-    return HubFile(path, str(place))
+        file = str(PurePosixPath(named.file).parent / name)
+        _stored(replace(named, file=file))
+    return HubFile(path, str(named))
 
 
 def _check_library() -> None:
@@ -90,32 +89,32 @@ def _declared(path: Path) -> list[str]:
     return sorted(name for name in side_files(path.read_bytes()) if stays_inside(name))
 
 
-def _stored(place: Place) -> Path:
+def _stored(uri: HubUri) -> Path:
     """Return the plain file that holds a file of a commit, after fetching it if need be.
 
     The hub's own cache keeps links into a folder of blobs, without the files' names: a model
     would not find its side files there, and `read_model` rightly refuses links. So plain files
     are kept, in the part of the cache that huggingface_hub has for other libraries.
     """
-    path = _folder(place) / place.file
+    path = _folder(uri) / uri.file
     if not os.path.isfile(path):
-        place, files = look_up(place)
-        if files and place.file not in files:
-            raise no_file(place, sorted(files))
-        _check_statistics(place, files)
-        data = download(place)
-        _check_whole(place, data, files.get(place.file))
+        uri, files = look_up(uri)
+        if files and uri.file not in files:
+            raise no_file(uri, sorted(files))
+        _check_statistics(uri, files)
+        data = download(uri)
+        _check_whole(uri, data, files.get(uri.file))
         write_bytes(path, data)
     return path
 
 
-def _folder(place: Place) -> Path:
+def _folder(uri: HubUri) -> Path:
     from huggingface_hub import cached_assets_path
 
     # The variable is read at the import of huggingface_hub as well, which may be long ago.
     root = os.environ.get("HF_ASSETS_CACHE")
     try:
-        return cached_assets_path("fdtasil", place.repo, place.revision or "", assets_dir=root)
+        return cached_assets_path("fdtasil", uri.repo, uri.revision or "", assets_dir=root)
     except (OSError, ValueError) as error:
         raise ExpertError(
             f"there is no room for files of the hub: {first_line(error)}",
@@ -124,27 +123,19 @@ def _folder(place: Place) -> Path:
         ) from error
 
 
-def _check_statistics(place: Place, files: "dict[str, RepoSibling]") -> None:
+def _check_statistics(uri: HubUri, files: "dict[str, RepoSibling]") -> None:
     """Refuse to leave out statistics that `read_agent` would find beside a zip on disk."""
-    agent = PurePosixPath(place.file)
-    found = [name for name in sorted(files) if _normalises(PurePosixPath(name), agent, files)]
+    agent = PurePosixPath(uri.file)
+    found = statistics_beside(agent, {PurePosixPath(name) for name in files})
     if agent.suffix == ".zip" and found:
         raise ExpertError(
-            f"{found[0]!r} lies beside {place} and looks like its observation statistics",
+            f"{str(found[0])!r} lies beside {uri} and looks like its observation statistics",
             "an agent without statistics",
             "download both; `fdtasil export-sb3 --vecnormalize` makes one ONNX file of them",
         )
 
 
-def _normalises(path: PurePosixPath, agent: PurePosixPath, files: Collection[str]) -> bool:
-    if path.parent == agent.parent:
-        return fnmatch.fnmatchcase(path.name, "*vec*norm*.pkl")
-    # In a folder below, as rl-zoo has it: another agent's are none of this one's business.
-    own = path.parent.name == agent.stem or str(path.parent / "config.yml") in files
-    return path.parent.parent == agent.parent and path.name == "vecnormalize.pkl" and own
-
-
-def _check_whole(place: Place, data: bytes, described: "RepoSibling | None") -> None:
+def _check_whole(uri: HubUri, data: bytes, described: "RepoSibling | None") -> None:
     """Refuse what a proxy or a broken connection made of a file: it would be kept for ever."""
     expected, found = None, None
     if described is not None and described.lfs is not None:
@@ -155,7 +146,7 @@ def _check_whole(place: Place, data: bytes, described: "RepoSibling | None") -> 
         found = hashlib.sha1(blob, usedforsecurity=False).hexdigest()
     if expected is not None and expected != found:
         raise ExpertError(
-            f"{place} arrived with {len(data):,} bytes and the hash {found}",
+            f"{uri} arrived with {len(data):,} bytes and the hash {found}",
             f"the hash {expected} that the hub names",
             "try again; if it stays so, something between here and the hub changes files",
         )

@@ -8,7 +8,7 @@ from dataclasses import replace
 from typing import TYPE_CHECKING, TypeVar
 
 from fdtasil.errors import ExpertError, first_line
-from fdtasil.experts.hub.place import COMMIT, Place, malformed
+from fdtasil.experts.hub.uri import COMMIT, HubUri, malformed
 
 if TYPE_CHECKING:
     from huggingface_hub.hf_api import RepoSibling
@@ -20,31 +20,31 @@ Part = TypeVar("Part")
 _SIZE_LIMIT = 2**31  # no ONNX model is larger with its weights: it is one protobuf message
 
 
-def look_up(place: Place) -> "tuple[Place, dict[str, RepoSibling]]":
-    """Return the place with its commit, and what the repository holds at it, by name."""
+def look_up(uri: HubUri) -> "tuple[HubUri, dict[str, RepoSibling]]":
+    """Return the uri with its commit, and what the repository holds at it, by name."""
     from huggingface_hub import HfApi
 
-    def answers() -> "Iterator[tuple[Place, dict[str, RepoSibling]]]":
+    def answers() -> "Iterator[tuple[HubUri, dict[str, RepoSibling]]]":
         info = HfApi(endpoint()).model_info(
-            place.repo, revision=place.revision, files_metadata=True, timeout=2 * patience()
+            uri.repo, revision=uri.revision, files_metadata=True, timeout=2 * patience()
         )
-        pinned = COMMIT.fullmatch(place.revision or "")
-        if not COMMIT.fullmatch(info.sha or "") or (pinned and info.sha != place.revision):
+        pinned = COMMIT.fullmatch(uri.revision or "")
+        if not COMMIT.fullmatch(info.sha or "") or (pinned and info.sha != uri.revision):
             raise ValueError(f"its answer names the commit {info.sha!r}")
         files = {sibling.rfilename: sibling for sibling in info.siblings or []}
-        yield replace(place, revision=info.sha), files
+        yield replace(uri, revision=info.sha), files
 
-    return next(_patiently(answers(), place))
+    return next(_patiently(answers(), uri))
 
 
-def download(place: Place) -> bytes:
+def download(uri: HubUri) -> bytes:
     """Return a file's bytes."""
     from huggingface_hub import get_session, hf_hub_url
     from huggingface_hub.utils import build_hf_headers, hf_raise_for_status
 
     # `hf_hub_download` would do, but for its retries: where nobody answers, it takes minutes.
     def answers() -> Iterator[bytes]:
-        url = hf_hub_url(place.repo, place.file, revision=place.revision, endpoint=endpoint())
+        url = hf_hub_url(uri.repo, uri.file, revision=uri.revision, endpoint=endpoint())
         with get_session().stream(
             "GET", url, headers=build_hf_headers(), follow_redirects=True, timeout=2 * patience()
         ) as response:
@@ -52,18 +52,18 @@ def download(place: Place) -> bytes:
             yield from response.iter_bytes()
 
     data = bytearray()
-    for part in _patiently(answers(), place):
+    for part in _patiently(answers(), uri):
         data += part
         if len(data) > _SIZE_LIMIT:
             raise ExpertError(
-                f"{place} has more than {_SIZE_LIMIT:,} bytes",
+                f"{uri} has more than {_SIZE_LIMIT:,} bytes",
                 "an ONNX file with its weights, or a stable-baselines3 zip",
                 "check that this is the right file",
             )
     return bytes(data)
 
 
-def _patiently(parts: Iterator[Part], place: Place) -> Iterator[Part]:
+def _patiently(parts: Iterator[Part], uri: HubUri) -> Iterator[Part]:
     """Yield the parts of an answer as they come, none later than the user's patience allows.
 
     They are waited for in a thread of their own, since a request's timeout holds for each address
@@ -88,70 +88,70 @@ def _patiently(parts: Iterator[Part], place: Place) -> Iterator[Part]:
         try:
             part, error = arrived.get(timeout=patience())
         except queue.Empty as nothing:
-            raise explain(nothing, place) from None
+            raise explain(nothing, uri) from None
         if error is not None:
-            raise explain(error, place) from error
+            raise explain(error, uri) from error
         if part is None:
             return
         yield part
 
 
-def explain(error: Exception, place: Place) -> ExpertError:
+def explain(error: Exception, uri: HubUri) -> ExpertError:
     """Return what a failed request means for the user, and what to do about it."""
     from huggingface_hub import errors
 
     status = getattr(getattr(error, "response", None), "status_code", None)
     log_in = "run `hf auth login`, or set HF_TOKEN"
     if isinstance(error, errors.HFValidationError):
-        return malformed(str(place))
+        return malformed(str(uri))
     if isinstance(error, errors.GatedRepoError) or status == 403:
         return ExpertError(
-            f"{place.repo} does not let you read {place.file} (HTTP {status})",
+            f"{uri.repo} does not let you read {uri.file} (HTTP {status})",
             "a public repository, or one that grants you access",
             f"accept its terms on its page on the hub if it has some, and {log_in}",
         )
     if isinstance(error, errors.RepositoryNotFoundError) or status == 401:
         return ExpertError(
-            f"there is no repository {place.repo}, or it is private (HTTP {status})",
+            f"there is no repository {uri.repo}, or it is private (HTTP {status})",
             "a public model repository, or one that you may read",
             f"check the spelling; if it is private, {log_in}",
         )
     if isinstance(error, errors.RevisionNotFoundError):
         return ExpertError(
-            f"{place.repo} has no revision {place.revision}",
+            f"{uri.repo} has no revision {uri.revision}",
             "a branch, a tag or a commit",
             "check the spelling, or leave out what follows the @ for the newest",
         )
     if isinstance(error, errors.EntryNotFoundError):
-        return no_file(place, [])
-    return _out_of_reach(error, status, place)
+        return no_file(uri, [])
+    return _out_of_reach(error, status, uri)
 
 
-def no_file(place: Place, names: list[str]) -> ExpertError:
+def no_file(uri: HubUri, names: list[str]) -> ExpertError:
     """Return the error of a file that is not there, with the names of those that may be meant."""
     likely = [name for name in names if name.endswith((".onnx", ".zip")) and name.isprintable()]
     shown = ", ".join(likely[:5]) or "a file of that commit, with its folders"
     return ExpertError(
-        f"{place.repo} has no file {place.file} at {place.revision}",
+        f"{uri.repo} has no file {uri.file} at {uri.revision}",
         f"{shown}{', ...' * (len(likely) > 5)}",
         "check the spelling, or name another revision after the @",
     )
 
 
-def _out_of_reach(error: Exception, status: int | None, place: Place) -> ExpertError:
+def _out_of_reach(error: Exception, status: int | None, uri: HubUri) -> ExpertError:
     from huggingface_hub import errors
 
     next_step = "check network, proxy and HF_ENDPOINT; or download the file, and name its path"
     if isinstance(error, errors.OfflineModeIsEnabled):
-        found = f"{place} is not on this machine, and HF_HUB_OFFLINE is set"
+        found = f"{uri} is not on this machine, and HF_HUB_OFFLINE is set"
         next_step = "unset it once; or download the file, and name its path"
     elif isinstance(error, queue.Empty):
-        found = f"{endpoint()} gave no answer within {patience():g} seconds for {place}"
+        found = f"{endpoint()} gave no answer within {patience():g} seconds for {uri}"
         next_step = (
             "check network, proxy and HF_ENDPOINT; for a slow hub, set HF_HUB_DOWNLOAD_TIMEOUT"
         )
     elif status is not None:
-        found = f"{endpoint()} answered HTTP {status} for {place}"
+        found = f"{endpoint()} answered HTTP {status} for {uri}"
     else:
         found = f"{endpoint()} can't be used: {type(error).__name__}: {first_line(error)}"
     return ExpertError(

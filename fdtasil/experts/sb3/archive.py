@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from fdtasil.errors import ExpertError, first_line
+from fdtasil.files.reading import read_limited
 from fdtasil.files.storage import sha256
 
 __all__ = ["Archive", "read_archive", "read_file"]
@@ -102,21 +103,7 @@ def read_file(path: Path) -> bytes:
     Raises:
         ExpertError: If it is larger, or can't be read.
     """
-    try:
-        size = path.stat().st_size
-        if size > _FILE_LIMIT:
-            raise ExpertError(
-                f"{path} has {size:,} bytes",
-                f"at most {_FILE_LIMIT:,} bytes",
-                "check that this is the right file",
-            )
-        return path.read_bytes()
-    except OSError as error:
-        raise ExpertError(
-            f"{path.absolute()} can't be read: {error.strerror}",
-            f"a file (relative paths start at {Path.cwd()})",
-            "check the path",
-        ) from error
+    return read_limited(path, _FILE_LIMIT, "a file")
 
 
 def _member(path: Path, content: bytes, name: str) -> bytes:

@@ -1,12 +1,14 @@
 """Writing an agent as one ONNX file that answers what the agent's `predict` answers."""
 
-from importlib.metadata import version
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
+import fdtasil
+from fdtasil.compute import ask_module
 from fdtasil.errors import ExpertError, SettingError
 from fdtasil.experts.sb3.agent import Agent, read_agent
 from fdtasil.experts.sb3.statistics import VecNormalizePath
@@ -98,16 +100,8 @@ def _random_states(agent: Agent) -> tuple[np.ndarray, str]:
 def _visited_states(agent: Agent, env: EnvironmentLike) -> tuple[np.ndarray, str]:
     with EnvironmentPool(env) as pool:
         _check_fit(agent, pool)
-        episodes = rollout(follow(_policy(agent.module)), pool, _SEEDS, _HORIZON)
+        episodes = rollout(follow(partial(ask_module, agent.module)), pool, _SEEDS, _HORIZON)
         return episodes.observations[episodes.valid], f"states of a rollout in {pool.name}"
-
-
-def _policy(module: torch.nn.Module):
-    def act(observations: np.ndarray) -> np.ndarray:
-        with torch.no_grad():
-            return module(torch.from_numpy(observations)).numpy()
-
-    return act
 
 
 def _check_fit(agent: Agent, pool: EnvironmentPool) -> None:
@@ -138,7 +132,7 @@ def _metadata(agent: Agent) -> dict[str, str]:
         "observation_size": str(agent.observation_size),
         "action_low": _numbers(agent.action_low),
         "action_high": _numbers(agent.action_high),
-        "fdtasil": version("fdtasil"),
+        "fdtasil": fdtasil.__version__,
         "torch": torch.__version__,
     }
     if agent.statistics_sha256 is not None:

@@ -1,6 +1,8 @@
 """The VecNormalize statistics that an agent was trained with: found, read with trust, checked."""
 
-from pathlib import Path
+from collections.abc import Collection
+from fnmatch import fnmatchcase
+from pathlib import Path, PurePath
 from typing import Literal
 
 import numpy as np
@@ -11,7 +13,7 @@ from fdtasil.experts.sb3.network import ObservationStatistics
 from fdtasil.experts.sb3.trust import Trust
 from fdtasil.files.storage import sha256
 
-__all__ = ["VecNormalizePath", "read_statistics"]
+__all__ = ["VecNormalizePath", "read_statistics", "statistics_beside"]
 
 VecNormalizePath = str | Path | Literal[False] | None
 
@@ -62,7 +64,9 @@ def read_statistics(
 
 def _check_neighbours(agent: Path) -> None:
     """Refuse to leave out statistics that lie where stable-baselines3's tools put them."""
-    found = _neighbours(agent)
+    folder = agent.parent
+    patterns = ("*.pkl", "*/vecnormalize.pkl", "*/config.yml")
+    found = statistics_beside(agent, {path for p in patterns for path in folder.glob(p)})
     if not found:
         return
     more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
@@ -74,17 +78,27 @@ def _check_neighbours(agent: Path) -> None:
     )
 
 
-def _neighbours(agent: Path) -> list[Path]:
-    # The hub and users save vec_normalize.pkl, callbacks ..._vecnormalize_..._steps.pkl.
-    found = set(agent.parent.glob("*vec*norm*.pkl"))
-    # rl-zoo writes <environment>/vecnormalize.pkl with its settings; any other folder below may
-    # belong to any other agent.
-    for file in agent.parent.glob("*/vecnormalize.pkl"):
-        if file.parent.name == agent.stem or (file.parent / "config.yml").exists():
-            found.add(file)
+def statistics_beside(agent: PurePath, files: Collection[PurePath]) -> list[PurePath]:
+    """Return what looks like an agent's statistics, the likeliest first.
+
+    Args:
+        agent: The zip.
+        files: All that lies beside it and one folder below.
+    """
+
+    def belongs(file: PurePath) -> bool:
+        if file.parent == agent.parent:
+            # The hub and users save vec_normalize.pkl, callbacks ..._vecnormalize_..._steps.pkl.
+            return fnmatchcase(file.name, "*vec*norm*.pkl")
+        # rl-zoo writes <environment>/vecnormalize.pkl with its settings; any other folder below
+        # may belong to any other agent.
+        own = file.parent.name == agent.stem or file.parent / "config.yml" in files
+        return file.parent.parent == agent.parent and file.name == "vecnormalize.pkl" and own
+
     # Of the checkpoints ..._1000_steps, ..._2000_steps the one of the same step comes first.
     return sorted(
-        found, key=lambda file: (file.stem.replace("vecnormalize_", "") != agent.stem, file)
+        filter(belongs, files),
+        key=lambda file: (file.stem.replace("vecnormalize_", "") != agent.stem, file),
     )
 
 

@@ -8,10 +8,11 @@ when one dies it says neither which nor how.
 from collections.abc import Callable
 from dataclasses import replace
 
+from fdtasil.checks import check_count, check_number
 from fdtasil.errors import ExpertError, SettingError
 from fdtasil.experts.expert import Expert
 from fdtasil.experts.workers.handle import WorkerProcess
-from fdtasil.experts.workers.pool import WorkerPool
+from fdtasil.experts.workers.pool import WorkerGroup
 from fdtasil.rollouts.behaviours import Policy
 
 __all__ = ["check_workers", "with_processes", "with_threads"]
@@ -33,16 +34,14 @@ def check_workers(workers: int, threads: bool, timeout: float | None, remote: bo
     Raises:
         SettingError: If the arguments don't go together.
     """
-    if isinstance(workers, bool) or not isinstance(workers, int) or workers < 0:
-        raise SettingError(f"workers={workers!r}", "a number of at least 0", "write workers=2")
+    check_count("workers", workers, least=0)
     if threads and not workers:
         raise SettingError(
             "threads=True with workers=0", "a number of threads", "write workers=2, threads=True"
         )
     if timeout is None:
         return
-    if isinstance(timeout, bool) or not 0 < timeout < float("inf"):
-        raise SettingError(f"timeout={timeout!r}", "a number of seconds", "write timeout=60")
+    check_number("timeout", timeout, positive=True)
     if not remote and (threads or not workers):
         raise SettingError(
             f"timeout={timeout:g} without processes",
@@ -54,7 +53,7 @@ def check_workers(workers: int, threads: bool, timeout: float | None, remote: bo
 def with_threads(expert: Expert, workers: int) -> Expert:
     """Return the expert, asked by so many threads of this process."""
     askers = [_Thread(expert.answer) for _ in range(workers)]
-    return replace(expert, workers=WorkerPool(askers))
+    return replace(expert, workers=WorkerGroup(askers))
 
 
 def with_processes(
@@ -85,7 +84,7 @@ def with_processes(
         ) from error
     titles = [f"worker {k + 1} of {workers} of {expert.name}" for k in range(workers)]
     askers = [WorkerProcess(title, parcel, timeout) for title in titles]
-    return replace(expert, workers=WorkerPool(askers))
+    return replace(expert, workers=WorkerGroup(askers))
 
 
 class _Thread:

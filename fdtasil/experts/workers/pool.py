@@ -13,7 +13,7 @@ import numpy as np
 
 from fdtasil.rollouts.behaviours import Policy
 
-__all__ = ["Asker", "WorkerPool"]
+__all__ = ["Asker", "WorkerGroup"]
 
 
 class Asker(Protocol):
@@ -32,7 +32,7 @@ class Asker(Protocol):
         ...
 
 
-class WorkerPool:
+class WorkerGroup:
     """Asks batches side by side. Nothing runs before the first; copies of an expert share it."""
 
     def __init__(self, askers: Sequence[Asker]) -> None:

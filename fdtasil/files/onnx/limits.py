@@ -99,11 +99,11 @@ def _look() -> None:
 def _register_allocator() -> None:
     import onnxruntime
 
-    place = onnxruntime.OrtMemoryInfo(
+    memory = onnxruntime.OrtMemoryInfo(
         "Cpu",
         onnxruntime.OrtAllocatorType.ORT_ARENA_ALLOCATOR,
         0,
         onnxruntime.OrtMemType.DEFAULT,
     )
     arena = onnxruntime.OrtArenaCfg({"max_mem": MEMORY})
-    onnxruntime.create_and_register_allocator(place, arena)
+    onnxruntime.create_and_register_allocator(memory, arena)

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 from fdtasil.errors import ExpertError
 from fdtasil.files.onnx.side_files import load_side_files, names_of_side_files
+from fdtasil.files.reading import read_limited
 from fdtasil.files.storage import sha256
 
 if TYPE_CHECKING:
@@ -81,21 +82,6 @@ def _read_bytes(path: Path) -> bytes:
             "an ONNX file",
             "name the file itself",
         )
-    try:
-        size = path.stat().st_size
-        if not 0 < size <= _SIZE_LIMIT:
-            raise ExpertError(
-                f"{path} has {size:,} bytes",
-                f"1 to {_SIZE_LIMIT:,} bytes",
-                "check that this is the right file",
-            )
-        return path.read_bytes()
-    except OSError as error:
-        beside = [
-            p.name for p in (path.with_name(f"{path.name}{end}") for end in _ENDS) if p.exists()
-        ]
-        raise ExpertError(
-            f"{path.absolute()} can't be read: {error.strerror}",
-            f"an ONNX file (relative paths start at {Path.cwd()})",
-            f"name it whole: {beside[0]}" if beside else "check the path",
-        ) from error
+    beside = [p.name for p in (path.with_name(f"{path.name}{end}") for end in _ENDS) if p.exists()]
+    hint = f"name it whole: {beside[0]}" if beside else "check the path"
+    return read_limited(path, _SIZE_LIMIT, "an ONNX file", hint)

@@ -8,7 +8,7 @@ from typing import TypeGuard
 from fdtasil.errors import ExpertError
 from fdtasil.files.storage import stays_inside
 
-__all__ = ["COMMIT", "Place", "is_hub_uri", "malformed", "parse"]
+__all__ = ["COMMIT", "HubUri", "is_hub_uri", "malformed", "parse"]
 
 _SCHEME = "hf:"
 # The hub's own names for other kinds of repositories come first in their URIs.
@@ -21,7 +21,7 @@ COMMIT = re.compile(r"[0-9a-f]{40}")
 
 
 @dataclass(frozen=True)
-class Place:
+class HubUri:
     """A file of a model repository; the revision None is the newest of the default branch."""
 
     repo: str
@@ -33,7 +33,7 @@ class Place:
 
 
 def is_hub_uri(source: object) -> TypeGuard[str | Path]:
-    """Whether an expert is named by its place on the hub, rightly spelt or not.
+    """Whether an expert is named by its uri on the hub, rightly spelt or not.
 
     Example:
         >>> is_hub_uri("hf://org/repo/walker.onnx"), is_hub_uri("walker.onnx")
@@ -42,7 +42,7 @@ def is_hub_uri(source: object) -> TypeGuard[str | Path]:
     return isinstance(source, (str, Path)) and str(source).startswith(_SCHEME)
 
 
-def parse(text: str) -> Place:
+def parse(text: str) -> HubUri:
     """Read a URI.
 
     Raises:
@@ -51,7 +51,7 @@ def parse(text: str) -> Place:
     found = _URI.fullmatch(text)
     if not found or not stays_inside(found["file"]):
         raise malformed(text)
-    return Place(found["repo"], str(PurePosixPath(found["file"])), found["revision"])
+    return HubUri(found["repo"], str(PurePosixPath(found["file"])), found["revision"])
 
 
 def malformed(text: str) -> ExpertError:
