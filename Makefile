@@ -4,11 +4,11 @@ BIN = .venv/bin
 # One thread per process: several at once on few cores are many times slower otherwise.
 export OMP_NUM_THREADS = 1
 
-.PHONY: demo test torture lint types check clean
+.PHONY: demo test torture lint types wheel check clean
 
 demo: .venv/ready
 	$(BIN)/fdtasil distill experts/HalfCheetah-v5.onnx HalfCheetah-v5 --probes 10 \
-		--episodes 5 --horizon 300 --compare --out runs/demo
+		--episodes 5 --horizon 300 --baseline --out runs/demo
 
 test: .venv/ready
 	$(BIN)/python -m pytest -q -n 2 -m "not slow"
@@ -24,7 +24,16 @@ lint: .venv/ready
 types: .venv/ready
 	$(BIN)/pyright
 
-check: lint types test
+# A wheel, installed into an empty environment, from which an empty folder is worked in.
+wheel: .venv/ready
+	rm -rf dist .wheel
+	$(BIN)/pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir dist .
+	$(PYTHON) -m venv .wheel
+	.wheel/bin/pip install --quiet --disable-pip-version-check -c constraints.txt torch
+	.wheel/bin/pip install --quiet --disable-pip-version-check -c constraints.txt dist/*.whl
+	cd .wheel && bin/python -P ../tests/wheel_run.py
+
+check: lint types wheel test
 
 # torch goes first and pinned: left to itself pip would take a build with gigabytes of CUDA.
 .venv/ready: pyproject.toml constraints.txt
@@ -34,4 +43,4 @@ check: lint types test
 	touch $@
 
 clean:
-	rm -rf .venv build dist
+	rm -rf .venv .wheel build dist
