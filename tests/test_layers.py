@@ -1,6 +1,8 @@
 """Imports run one way between the rooms, and the face loads nothing heavy."""
 
 import ast
+import os
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -78,11 +80,51 @@ def test_few_files_import_stable_baselines3():
 def test_the_face_is_light():
     heavy = ["stable_baselines3", "matplotlib", "onnx", "onnxruntime", "scipy.stats"]
     heavy += ["huggingface_hub"]
-    code = f"import sys, fdtasil; print([m for m in {heavy} if m in sys.modules])"
+    named = "import sys, fdtasil; fdtasil.distill"
+    assert _loaded(named, heavy) == []
+    assert _loaded("import sys, fdtasil", [*heavy, "numpy", "torch", "gymnasium", "tyro"]) == []
+    start = "import sys; sys.argv[1:] = ['--help']; import fdtasil.shell.main as m; m.main()"
+    assert _loaded(start, [*heavy, "numpy", "torch", "gymnasium", "tyro"]) == []
+
+
+def _loaded(code: str, modules: list[str]) -> list[str]:
+    """Return which modules are loaded after some code, run in a process of its own."""
+    code = f"{code}; print(*(m for m in {modules} if m in sys.modules), sep=',')"
     shown = subprocess.run(
         [sys.executable, "-c", code], capture_output=True, text=True, check=True
     )
-    assert shown.stdout.strip() == "[]"
+    return [name for name in shown.stdout.splitlines()[-1].split(",") if name]
+
+
+def test_it_runs_from_a_plain_checkout(tmp_path):
+    """Without being installed, and without metadata that say which version it is."""
+    shutil.copytree(HOUSE, tmp_path / "fdtasil", ignore=shutil.ignore_patterns("__pycache__"))
+    code = """
+import importlib.metadata as metadata
+known = metadata.version
+def version(name):
+    if name == "fdtasil":
+        raise metadata.PackageNotFoundError(name)
+    return known(name)
+metadata.version = version
+import fdtasil
+result = fdtasil.distill(
+    lambda rows: -rows[:, :1], "Pendulum-v1", 0, episodes=1, horizon=5, evaluation_episodes=0,
+    fit=fdtasil.Fit(steps=1), student=fdtasil.Mlp(4), out="run", force=True,
+)
+print(fdtasil.__file__, result.report["versions"]["fdtasil"])
+"""
+    shown = subprocess.run(
+        [sys.executable, "-c", code],
+        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    file, version = shown.stdout.split()
+    assert Path(file).parent == tmp_path / "fdtasil"
+    assert version == fdtasil.__version__
 
 
 def test_the_face_has_what_it_names():
