@@ -1,6 +1,6 @@
 """Means that one bad seed does not rule, and how sure they are."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 
 import numpy as np
@@ -59,7 +59,7 @@ def interval_text(values: Sequence[float], digits: int = 2) -> str:
 
 
 def paired_difference(
-    ours: dict[int, float], theirs: dict[int, float]
+    ours: Mapping[int, float], theirs: Mapping[int, float]
 ) -> tuple[float, tuple[float, float]]:
     """Return the mean of ours - theirs over the seeds that both have, and its 95 % interval."""
     seeds = sorted(ours.keys() & theirs.keys())
