@@ -72,7 +72,7 @@ def test_a_state_is_never_probed_along_the_same_direction_twice():
 
 
 def test_a_whole_frame_is_orthonormal():
-    bank, numbers = OrthogonalFrames().draw(9, states(5), np.random.default_rng(0))
+    bank, numbers = OrthogonalFrames(None).draw(9, states(5), np.random.default_rng(0))
     for frame in bank[numbers]:
         assert np.allclose(frame @ frame.T, np.eye(5), atol=1e-12)
 

@@ -210,7 +210,7 @@ directions = st.one_of(
     st.builds(DIRECTIONS["sphere"], counts),
     st.builds(DIRECTIONS["orthogonal"], counts),
     st.just(DIRECTIONS["basis"]()),
-    st.just(OrthogonalFrames()),
+    st.just(OrthogonalFrames(None)),
 )
 radii = st.none() | st.floats(0, exclude_min=True, allow_infinity=False, allow_nan=False)
 sources = st.builds(

@@ -6,7 +6,7 @@ from typing import ClassVar
 import numpy as np
 
 from fdtasil.checks import check_count
-from fdtasil.probes.directions import USUAL_COUNT, RandomSphere, count_of
+from fdtasil.probes.directions import USUAL_COUNT, RandomSphere
 
 __all__ = ["AdaptiveDirections", "is_redundant"]
 
@@ -36,15 +36,6 @@ class AdaptiveDirections:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "probes", check_count("probes", self.probes))
-
-    @classmethod
-    def parse(cls, count: str | None) -> "AdaptiveDirections":
-        """See `Directions.parse`."""
-        return cls(count_of(count))
-
-    def describe(self) -> str:
-        """See `Directions.describe`."""
-        return f"{self.name}:{self.probes}"
 
     def count(self, dimension: int) -> int:
         """As many as asked for."""

@@ -14,7 +14,6 @@ __all__ = [
     "OrthogonalFrames",
     "RandomSphere",
     "StandardBasis",
-    "count_of",
 ]
 
 USUAL_COUNT = 10
@@ -35,19 +34,6 @@ class Directions(Protocol):
 
     name: ClassVar[str]
     exact: ClassVar[bool]
-
-    @classmethod
-    def parse(cls, count: str | None) -> "Directions":
-        """Return the design, with the text after its colon, if there is one.
-
-        Raises:
-            ValueError: If it can't be so many.
-        """
-        ...
-
-    def describe(self) -> str:
-        """Return the text that names design and count, which `Probes.parse` reads back."""
-        ...
 
     def count(self, dimension: int) -> int:
         """Return how many directions each state is probed along."""
@@ -80,16 +66,6 @@ class StandardBasis:
     name: ClassVar[str] = "basis"
     exact: ClassVar[bool] = False
 
-    @classmethod
-    def parse(cls, count: str | None) -> "StandardBasis":
-        """See `Directions.parse`."""
-        _no_count(cls.name, count)
-        return cls()
-
-    def describe(self) -> str:
-        """See `Directions.describe`."""
-        return self.name
-
     def count(self, dimension: int) -> int:
         """One for each coordinate."""
         return dimension
@@ -117,15 +93,6 @@ class RandomSphere:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "probes", check_count("probes", self.probes))
-
-    @classmethod
-    def parse(cls, count: str | None) -> "RandomSphere":
-        """See `Directions.parse`."""
-        return cls(count_of(count))
-
-    def describe(self) -> str:
-        """See `Directions.describe`."""
-        return f"{self.name}:{self.probes}"
 
     def count(self, dimension: int) -> int:
         """As many as asked for."""
@@ -161,22 +128,13 @@ class OrthogonalFrames:
         probes: Directions for each state, or None for one whole frame.
     """
 
-    probes: int | None = None
+    probes: int | None = USUAL_COUNT
     name: ClassVar[str] = "orthogonal"
     exact: ClassVar[bool] = False
 
     def __post_init__(self) -> None:
         if self.probes is not None:
             object.__setattr__(self, "probes", check_count("probes", self.probes))
-
-    @classmethod
-    def parse(cls, count: str | None) -> "OrthogonalFrames":
-        """See `Directions.parse`; "all" is one whole frame."""
-        return cls(None if count == "all" else count_of(count))
-
-    def describe(self) -> str:
-        """See `Directions.describe`."""
-        return f"{self.name}:{'all' if self.probes is None else self.probes}"
 
     def count(self, dimension: int) -> int:
         """As many as asked for, or one for each coordinate."""
@@ -213,16 +171,6 @@ class Jacobian:
     name: ClassVar[str] = "jacobian"
     exact: ClassVar[bool] = True
 
-    @classmethod
-    def parse(cls, count: str | None) -> "Jacobian":
-        """See `Directions.parse`."""
-        _no_count(cls.name, count)
-        return cls()
-
-    def describe(self) -> str:
-        """See `Directions.describe`."""
-        return self.name
-
     def count(self, dimension: int) -> int:
         """One for each coordinate."""
         return dimension
@@ -235,25 +183,7 @@ class Jacobian:
         self, rows: int, states: np.ndarray, random: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray]:
         """See `Directions.draw`."""
-        return OrthogonalFrames().draw(rows, states, random)
-
-
-def count_of(text: str | None) -> int:
-    """Return the count that a design is written with, or the usual one.
-
-    Raises:
-        ValueError: If it is no positive integer.
-    """
-    if text is None:
-        return USUAL_COUNT
-    if not text.isdigit() or int(text) == 0:
-        raise ValueError(f"{text} is no number of directions")
-    return int(text)
-
-
-def _no_count(name: str, count: str | None) -> None:
-    if count is not None:
-        raise ValueError(f"{name} takes no count")
+        return OrthogonalFrames(None).draw(rows, states, random)
 
 
 def _runs(starts: np.ndarray, length: int, size: int) -> np.ndarray:

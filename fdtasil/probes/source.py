@@ -18,7 +18,7 @@ from fdtasil.probes.stencils import CENTRAL, EXACT, FORWARD, LABELS, Stencil
 
 __all__ = ["DIRECTIONS", "Probes"]
 
-DIRECTIONS: dict[str, type[Directions]] = {
+DIRECTIONS: dict[str, Any] = {
     design.name: design
     for design in (AdaptiveDirections, StandardBasis, RandomSphere, OrthogonalFrames, Jacobian)
 }
@@ -70,7 +70,7 @@ class Probes:
         if (self.stencil is EXACT) != self.directions.exact:
             name = self.stencil.name if self.stencil else "open"
             raise SettingError(
-                f"the {name} stencil with {self.directions.describe()!r}",
+                f"the {name} stencil with {self.directions.name} directions",
                 "a finite stencil with asked directions, and none with differentiated ones",
                 'write probes="jacobian" for the exact derivative',
             )
@@ -107,7 +107,7 @@ class Probes:
 
     def describe(self) -> str:
         """Return the text that `parse` reads back, with the radius where it is set."""
-        parts = [self.directions.describe()]
+        parts = [_describe(self.directions)]
         parts += [self.stencil.name] if self.stencil not in (None, EXACT) else []
         parts += ["resample"] if self.resample else []
         parts += [self.space] if self.space else []
@@ -182,6 +182,11 @@ _NUMBERS: dict[str, Callable[[str], object]] = {
 }
 
 
+def _describe(directions: Directions) -> str:
+    count = getattr(directions, "probes", "")
+    return f"{directions.name}:{'all' if count is None else count}".rstrip(":")
+
+
 def _parse_text(spec: str) -> Probes:
     design, *options = (part.strip() for part in spec.split(","))
     name, colon, count = (f"adaptive:{design}" if design.isdigit() else design).partition(":")
@@ -189,10 +194,14 @@ def _parse_text(spec: str) -> Probes:
         number = not set(name) - set("-+.0123456789")
         advice = _EXAMPLES if number else f"designs: {', '.join(DIRECTIONS)}"
         raise SettingError(f"probes={spec!r}", _GRAMMAR, advice)
+    design, counted = DIRECTIONS[name], "probes" in DIRECTIONS[name].__dataclass_fields__
+    if colon and not counted:
+        raise SettingError(f"probes={spec!r}: {name} takes no count", _GRAMMAR, f'write "{name}"')
     try:
-        directions = DIRECTIONS[name].parse(count if colon else None)
-    except ValueError as error:
-        raise SettingError(f"probes={spec!r}: {error}", _GRAMMAR, _EXAMPLES) from None
+        counts = [None if count == "all" else int(count)] if colon else []
+        directions = design(*counts)
+    except ValueError:  # no number, or none that can be used
+        raise SettingError(f"probes={spec!r}", _GRAMMAR, _EXAMPLES) from None
     fields: dict[str, Any] = {}
     for option in options:
         fields |= _parse_option(option, spec)

@@ -29,7 +29,7 @@ from fdtasil.run.configuration import Configuration
 from fdtasil.run.events import Callback, Event, tell_all
 from fdtasil.run.folder import open_run_folder
 from fdtasil.run.interrupts import heard_interrupts
-from fdtasil.run.report import noted_warnings, report_of, versions
+from fdtasil.run.report import config_of, noted_warnings, report_of
 from fdtasil.run.rounds import Rounds
 from fdtasil.run.subject import Subject, open_subject
 from fdtasil.run.training import Training
@@ -132,9 +132,7 @@ def distill(
         >>> result.student.predict(result.demonstrations.observations[0])[0].shape
         (1,)
     """
-    if out is not None and resume is not None:
-        found = f"out={str(out)!r} beside resume={str(resume)!r}"
-        raise SettingError(found, "one folder", "leave out= out: a resumed run stays in its own")
+    folder = _folder_of(out, resume)
     given = None if dataset is None else load_dataset(dataset)
     arguments = read_arguments(
         given,
@@ -152,26 +150,20 @@ def distill(
         device=device,
     )
     torch_device, told = pick_device(device), tell_all(callback)
-    path = out if resume is None else resume
-    folder = None if path is None else Path(path)
     with noted_warnings() as notes, open_subject(expert, env, given) as subject:
         run = arguments.configure(subject)
         run.check_budget()
-        config = {**run.to_json(), "versions": versions()}
         with (
-            open_run_folder(folder, config, resume=resume is not None) as kept,
+            open_run_folder(folder, config_of(run), resume=resume is not None) as kept,
             heard_interrupts() as interrupts,
         ):
             if folder and kept.finished and resume is not None:
                 return Distilled.load(folder, student_obs)
             account = Account(subject.expert.queries if subject.expert else {}, notes)
-            asking, bars = Asking(run, subject.expert, account), Progress(progress)
-            checkpoints = Checkpoints(kept, account, asking)
-            training = Training(run, torch_device, asking, checkpoints, bars, interrupts, told)
-            collecting = _collecting(run, subject, bars)
-            rounds = Rounds(
-                run, student_obs, collecting, asking, training, checkpoints, bars, told
-            )
+            asking = Asking(run, subject.expert, account)
+            checkpoints, bars = Checkpoints(kept, account, asking), Progress(progress)
+            training = Training(run, torch_device, checkpoints, bars, interrupts, told)
+            rounds = Rounds(run, student_obs, _collecting(run, subject, bars), training)
             result = _complete(rounds, subject, given, torch_device, force=force)
             if folder:
                 result.save(folder)
@@ -233,6 +225,15 @@ def evaluate(
         return evaluate_pair(answer, black_box, theirs, pool, length, seed, bars)
 
 
+def _folder_of(out: str | Path | None, resume: str | Path | None) -> Path | None:
+    """Return the folder of a run, or None where it has none."""
+    if out is not None and resume is not None:
+        found = f"out={str(out)!r} beside resume={str(resume)!r}"
+        raise SettingError(found, "one folder", "leave out= out: a resumed run stays in its own")
+    path = out if resume is None else resume
+    return None if path is None else Path(path)
+
+
 def _collecting(run: Configuration, subject: Subject, bars: Progress) -> Collecting | None:
     """Return what records the demonstrations; None where they are given."""
     expert, pool = subject.expert, subject.pool
@@ -250,12 +251,12 @@ def _complete(
     force: bool,
 ) -> Distilled:
     """Gate, rounds, evaluation, report."""
-    run, account = rounds.run, rounds.checkpoints.account
+    run, checkpoints = rounds.run, rounds.training.checkpoints
     with torch_settings(device) as precision:
         theirs = _examined(rounds, subject, force=force)
-        account.start_clock()
+        checkpoints.account.start_clock()
         lesson, trained = rounds.complete(given)
-        seconds, student, evaluation = account.seconds, trained.student, None
+        seconds, student, evaluation = checkpoints.account.seconds, trained.student, None
         if subject.expert is not None and subject.pool is not None and theirs is not None:
             policy, last = lesson.view.policy(student.act), trained.history[-1]
             evaluation = evaluate_pair(
@@ -265,16 +266,16 @@ def _complete(
                 subject.pool,
                 run.horizon,
                 run.seed,
-                rounds.progress,
+                rounds.training.progress,
             )
             about = int(last["round"]), trained.steps, last
-            rounds.callback(Event("evaluation", *about, student, evaluation))
+            rounds.training.callback(Event("evaluation", *about, student, evaluation))
     report = report_of(
         run,
         evaluation,
         lesson,
         trained.steps,
-        rounds.checkpoints,
+        checkpoints,
         train_seconds=seconds,
         matmul_precision=precision,
     )
@@ -283,7 +284,7 @@ def _complete(
         evaluation=evaluation,
         history=trained.history,
         queries=report["queries"],
-        settings={**run.to_json(), "versions": report["versions"]},
+        settings=config_of(run),
         report=report,
         dataset=lesson.dataset,
         view=lesson.view,
@@ -300,5 +301,5 @@ def _examined(rounds: Rounds, subject: Subject, *, force: bool) -> Episodes | No
     if not run.evaluation_episodes:
         check_first(expert, pool, starts, force=force, rows=rows)
         return None
-    bars = rounds.progress
+    bars = rounds.training.progress
     return examine(expert, pool, starts, run.horizon, bars, force=force, rows=rows)

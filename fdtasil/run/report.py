@@ -1,4 +1,4 @@
-"""What a run says of itself: `report.json`, and the warnings on the way."""
+"""What a run says of itself: `config.json`, `report.json`, and the warnings on the way."""
 
 import platform
 import warnings
@@ -15,7 +15,7 @@ from fdtasil.run.checkpoints import Checkpoints
 from fdtasil.run.configuration import Configuration
 from fdtasil.run.lesson import Lesson
 
-__all__ = ["noted_warnings", "report_of", "versions"]
+__all__ = ["config_of", "noted_warnings", "report_of", "versions"]
 
 _VERSIONED = ("torch", "numpy", "gymnasium", "mujoco", "onnx", "onnxruntime")
 
@@ -24,6 +24,11 @@ def versions() -> dict[str, str]:
     """Return the versions that a run's bytes depend on."""
     ours = {"python": platform.python_version(), "fdtasil": fdtasil.__version__}
     return ours | {name: version(name) for name in _VERSIONED}
+
+
+def config_of(run: Configuration) -> dict[str, Any]:
+    """Return what `config.json` holds, as plain JSON values."""
+    return {**run.to_json(), "versions": versions()}
 
 
 def report_of(

@@ -7,9 +7,7 @@ import numpy as np
 
 from fdtasil.demonstrations.dataset import Dataset
 from fdtasil.probes.answers import Answers, Beginning
-from fdtasil.progress import Progress
 from fdtasil.rollouts.behaviours import Policy
-from fdtasil.run.asking import Asking
 from fdtasil.run.checkpoints import (
     ASKED,
     COLLECTED,
@@ -21,7 +19,7 @@ from fdtasil.run.checkpoints import (
 )
 from fdtasil.run.collecting import Collecting
 from fdtasil.run.configuration import Configuration
-from fdtasil.run.events import Callback, Event
+from fdtasil.run.events import Event
 from fdtasil.run.lesson import Lesson
 from fdtasil.run.training import Training
 from fdtasil.student.view import StudentObservation
@@ -37,21 +35,18 @@ class Rounds:
         run: The configuration.
         student_obs: What the student sees; None for everything.
         collecting: Records; None where the dataset is given.
-        asking: Asks the probes.
-        training: Makes each round's student.
-        checkpoints: Keep every stage.
-        progress: Progress bars.
-        callback: Told of each round.
+        training: Makes each round's student; its checkpoints, bars and callback are the run's.
     """
 
     run: Configuration
     student_obs: StudentObservation | None
     collecting: Collecting | None
-    asking: Asking
     training: Training
-    checkpoints: Checkpoints
-    progress: Progress
-    callback: Callback
+
+    @property
+    def checkpoints(self) -> Checkpoints:
+        """Where every stage is kept."""
+        return self.training.checkpoints
 
     def complete(self, given: Dataset | None) -> tuple[Lesson, Trained]:
         """Do every round, beginning where the folder's checkpoints end.
@@ -70,7 +65,7 @@ class Rounds:
             lesson = Lesson.of(collected, self.student_obs, lesson)
             trained = self._trained(round_, lesson, trained)
             last = trained.history[-1]
-            self.callback(Event("round", round_, trained.steps, last, trained.student))
+            self.training.callback(Event("round", round_, trained.steps, last, trained.student))
         assert lesson is not None
         assert trained is not None, "every run has a round"
         return lesson, trained
@@ -132,14 +127,17 @@ class Rounds:
         answers = self._answers(round_, states.observations, around)
         answers = answers if old is None else old + answers
         return replace(
-            whole, dataset=replace(whole.dataset, probes=self.asking.source, answers=answers)
+            whole,
+            dataset=replace(whole.dataset, probes=self.checkpoints.asking.source, answers=answers),
         )
 
     def _answers(self, round_: int, observations: np.ndarray, lesson: Lesson) -> Answers:
         """Ask the probes around a round's states; the answers are kept on the way."""
         known = self.checkpoints.take_up(round_, ASKED)
-        self.asking.calibrate(lesson.dataset.demonstrations.observations, lesson.scales)
-        with self.progress.bar("probes", "state", len(observations)) as bar:
+        self.checkpoints.asking.calibrate(
+            lesson.dataset.demonstrations.observations, lesson.scales
+        )
+        with self.training.progress.bar("probes", "state", len(observations)) as bar:
 
             def told(values: np.ndarray, states: int) -> None:
                 bar.move(states)
@@ -147,4 +145,6 @@ class Rounds:
                     self.checkpoints.keep(round_, ASKED, lambda: values, len(values))
 
             beginning = Beginning(known, told)
-            return self.asking.ask(observations, lesson.scales, round_, 0, beginning=beginning)
+            return self.checkpoints.asking.ask(
+                observations, lesson.scales, round_, 0, beginning=beginning
+            )

@@ -10,7 +10,7 @@ from fdtasil.errors import warn
 from fdtasil.probes.answers import Answers
 from fdtasil.probes.scales import measure_scales
 from fdtasil.progress import Bar, Progress
-from fdtasil.run.asking import Asking, Samples
+from fdtasil.run.asking import Samples
 from fdtasil.run.checkpoints import TRAINING, Checkpoints, Halfway, Trained
 from fdtasil.run.configuration import Configuration
 from fdtasil.run.events import Callback, Event
@@ -31,8 +31,7 @@ class Training:
     Attributes:
         run: The configuration.
         device: Where it is trained.
-        asking: Asks new directions where the source resamples.
-        checkpoints: Keep a training on its way.
+        checkpoints: Keep a training on its way, and know what is asked where the source resamples.
         progress: Progress bars.
         interrupts: Which wait for a checkpoint.
         callback: Told of entries of the history.
@@ -40,7 +39,6 @@ class Training:
 
     run: Configuration
     device: torch.device
-    asking: Asking
     checkpoints: Checkpoints
     progress: Progress
     interrupts: Interrupts
@@ -64,7 +62,7 @@ class Training:
             entries = fit(
                 student,
                 seen,
-                self.asking.source,
+                self.checkpoints.asking.source,
                 _seen_by(lesson, samples) if samples else None,
                 run.fit,
                 lambda name: torch_generator(run.seed, "batches", round_, name),
@@ -81,11 +79,13 @@ class Training:
 
     def _samples(self, round_: int, lesson: Lesson, kept: Halfway | None) -> Samples | None:
         stored = lesson.dataset.answers
-        if self.asking.source is None or stored is None:
+        if self.checkpoints.asking.source is None or stored is None:
             return None
         observations = lesson.dataset.demonstrations.observations
         asked_before = kept.sample if kept else -1
-        return Samples(self.asking, stored, observations, lesson.scales, round_, asked_before)
+        return Samples(
+            self.checkpoints.asking, stored, observations, lesson.scales, round_, asked_before
+        )
 
     def _fresh(self, seen: Demonstrations, lesson: Lesson, round_: int) -> Student:
         scales, bounds = measure_scales(seen.observations), lesson.dataset
