@@ -1,5 +1,6 @@
 """Toy experts with known derivatives, and ONNX files as users have them."""
 
+from collections import Counter
 from itertools import pairwise
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from onnx import TensorProto, helper, numpy_helper
 from toy_environments import Integrator
 
 import fdtasil
+from fdtasil.run.folder import RunFolder
 
 GAIN = np.array([[-0.5, 0.1, -0.7, 0.0, 0.0], [0.0, -0.4, 0.1, -0.6, 0.0]], np.float32)
 TOY = "toy_environments:toy/Integrator-v0"
@@ -157,6 +159,30 @@ def quick(linear):
 def quick_folder(quick, tmp_path_factory):
     """Where it is saved; not to be changed either."""
     return quick.save(tmp_path_factory.mktemp("quick") / "run")
+
+
+@pytest.fixture(scope="module")
+def no_pictures():
+    """Pictures are not drawn: for tests that save many runs and look at other files of them."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name in ("training", "returns", "calibration"):
+            patch.setattr(f"fdtasil.results.figures.draw_{name}", lambda *drawn: b"no picture")
+        yield
+
+
+@pytest.fixture
+def many_checkpoints(monkeypatch):
+    """One of so many moments at which a checkpoint may be taken is used, whatever the time.
+
+    An odd number: a training goes on after odd and after even steps then.
+    """
+    asked = Counter()
+
+    def due(folder):
+        asked[id(folder)] += 1
+        return folder._path is not None and asked[id(folder)] % 21 == 0
+
+    monkeypatch.setattr(RunFolder, "due", property(due))
 
 
 @pytest.fixture

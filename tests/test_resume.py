@@ -7,8 +7,9 @@ import pytest
 from conftest import QUICK, TOY, mlp_onnx
 
 import fdtasil
+from fdtasil import Fit
 from fdtasil.errors import FdtasilWarning, SettingError
-from fdtasil.run import folder as runfolder
+from fdtasil.run.folder import RunFolder
 
 FILES = (
     "student.safetensors",
@@ -17,16 +18,19 @@ FILES = (
     "progress.csv",
     "config.json",
 )
-RUN = {**QUICK, "trainer": "dagger", "probes": "sphere:2,resample", "episodes": 6, "steps": 150}
+pytestmark = pytest.mark.usefixtures("no_pictures", "many_checkpoints")
+
+RUN = {
+    **QUICK,
+    "trainer": "dagger",
+    "probes": "sphere:2,resample",
+    "episodes": 6,
+    "fit": Fit(steps=150),
+}
 
 
 class Stop(Exception):
     """Stands for a kill in the tests that stay in this process."""
-
-
-@pytest.fixture(autouse=True)
-def checkpoint_at_every_epoch(monkeypatch):
-    monkeypatch.setattr(runfolder, "CHECKPOINT_SECONDS", 0.0)
 
 
 @pytest.fixture(scope="module")
@@ -85,7 +89,7 @@ def test_stopped_again_and_again(expert, golden, tmp_path):
 
 
 def test_validation_and_best_weights_are_resumed(expert, tmp_path):
-    run = {**RUN, "trainer": "bc", "validation": 0.3, "patience": 50, "steps": 300}
+    run = {**RUN, "trainer": "bc", "fit": Fit(steps=300, validation=0.3, patience=50)}
     fdtasil.distill(expert, TOY, out=tmp_path / "golden", **run)
     with pytest.raises(Stop):
         fdtasil.distill(expert, TOY, out=tmp_path / "run", callback=stop_at(3), **run)
@@ -97,7 +101,7 @@ def test_validation_and_best_weights_are_resumed(expert, tmp_path):
 def test_another_configuration_is_refused_with_the_difference(expert, tmp_path):
     with pytest.raises(Stop):
         fdtasil.distill(expert, TOY, out=tmp_path / "run", callback=stop_at(2), **RUN)
-    other = {**RUN, "seed": 4, "weight_decay": 0.5}
+    other = {**RUN, "seed": 4, "fit": Fit(steps=150, weight_decay=0.5)}
     with pytest.raises(
         SettingError, match=r"fit\.weight_decay was 0\.01, is 0\.5; seed was 0, is 4"
     ):
@@ -164,6 +168,7 @@ def test_a_resumed_run_stays_in_its_own_folder(expert, tmp_path):
 def test_stopped_while_the_probes_are_asked_nothing_is_lost(kept, tmp_path, monkeypatch):
     """Demonstrations are kept before the probes, and the answers on the way, block by block."""
     monkeypatch.setattr("fdtasil.probes.answers._ROWS", 500)
+    monkeypatch.setattr(RunFolder, "due", property(lambda folder: folder._path is not None))
     run = {**QUICK, "episodes": 5, "horizon": 40, "probes": "sphere:10,forward"}
     blocks, last, acting = 0, None, 0
 

@@ -1,5 +1,6 @@
 """Data that can't be trained on, training that breaks, arguments that are misspelt."""
 
+import copy
 import json
 from dataclasses import replace
 
@@ -10,10 +11,12 @@ import torch
 from conftest import QUICK, TOY
 
 import fdtasil
+from fdtasil import Fit, Mlp
 from fdtasil.errors import ExpertError, FitError, SettingError
-from fdtasil.run import folder as runfolder
 
-WHOLE = {"steps": 40, "hidden": 8}
+WHOLE = {"student": Mlp(8), "fit": Fit(steps=40)}
+
+pytestmark = pytest.mark.usefixtures("no_pictures")
 
 
 def changed(dataset, **arrays):
@@ -27,49 +30,49 @@ def spoilt(array, value, row=3):
     return copy
 
 
-def refused(dataset, monkeypatch):
-    """The error of a training on given demonstrations, before it begins."""
+@pytest.fixture
+def refused(nothing_is_trained):
+    """What is said of a dataset that is refused before a training begins."""
 
-    def never(*arguments, **named):
-        raise AssertionError("training began")
+    def found(dataset):
+        with pytest.raises(SettingError, match="demonstrations whose") as error:
+            fdtasil.distill(dataset=dataset, **WHOLE)
+        assert len(str(error.value).splitlines()) <= 6
+        return error.value.found
 
-    monkeypatch.setattr("fdtasil.run.training.fit", never)
-    with pytest.raises(SettingError, match="demonstrations whose") as error:
-        fdtasil.distill(demonstrations=dataset, **WHOLE)
-    assert len(str(error.value).splitlines()) <= 6
-    return error.value.found
+    return found
 
 
 # --- given data
 
 
 @pytest.mark.fault(94)
-@pytest.mark.parametrize("episodes", [0, -1, 1.5, True, None])
+@pytest.mark.parametrize("episodes", [0, -1, 1.5, True, "2"])
 def test_no_episodes_are_refused_before_anything_is_asked(episodes):
     def never(rows):
         raise AssertionError("asked")
 
-    with pytest.raises(SettingError, match=f"episodes={episodes}"):
+    with pytest.raises(SettingError, match=f"episodes={episodes!r}"):
         fdtasil.distill(never, TOY, 1, **{**QUICK, "episodes": episodes})
 
 
 @pytest.mark.fault(94)
 @pytest.mark.parametrize("kind", ["dataset", "file"])
-def test_demonstrations_without_a_state_are_refused(kind, quick, tmp_path, monkeypatch):
+def test_demonstrations_without_a_state_are_refused(kind, quick, tmp_path, refused):
     none = {name: array[:0] for name, array in vars(quick.demonstrations).items()}
     dataset = replace(changed(quick.dataset, **none), answers=None, probes=None)
     (tmp_path / "demonstrations.npz").write_bytes(dataset.to_bytes())
     source = dataset if kind == "dataset" else tmp_path
-    assert refused(source, monkeypatch).endswith("observations have the shape (0, 5)")
+    assert refused(source).endswith("observations have the shape (0, 5)")
 
 
 @pytest.mark.fault(99)
 @pytest.mark.parametrize("name", ["actions", "taken", "observations", "episode", "rewards"])
-def test_demonstrations_of_shapes_that_would_broadcast_are_refused(name, quick, monkeypatch):
+def test_demonstrations_of_shapes_that_would_broadcast_are_refused(name, quick, refused):
     array = getattr(quick.demonstrations, name)
     for wrong in (array[:-1], array[..., None], array.reshape(-1)[:40] if array.ndim > 1 else 0):
         if isinstance(wrong, np.ndarray):
-            found = refused(changed(quick.dataset, **{name: wrong}), monkeypatch)
+            found = refused(changed(quick.dataset, **{name: wrong}))
             assert "have the shape" in found
 
 
@@ -87,18 +90,18 @@ def test_an_expert_that_answers_a_vector_is_refused():
 @pytest.mark.fault(100)
 @pytest.mark.parametrize("value", [np.nan, np.inf])
 @pytest.mark.parametrize("name", ["observations", "actions"])
-def test_given_data_that_is_not_finite_is_refused_before_training(name, value, quick, monkeypatch):
+def test_given_data_that_is_not_finite_is_refused_before_training(name, value, quick, refused):
     array = getattr(quick.demonstrations, name)
-    found = refused(changed(quick.dataset, **{name: spoilt(array, value)}), monkeypatch)
+    found = refused(changed(quick.dataset, **{name: spoilt(array, value)}))
     assert found.endswith(f"{name} are not finite in 1 of 40 rows, the first of them row 3")
 
 
 @pytest.mark.fault(100)
 @pytest.mark.parametrize("name", ["values", "displacements"])
-def test_given_answers_that_are_not_finite_are_refused(name, quick, monkeypatch):
+def test_given_answers_that_are_not_finite_are_refused(name, quick, refused):
     array = getattr(quick.answers, name)
     answers = replace(quick.answers, **{name: spoilt(array, np.nan)})
-    assert name in refused(replace(quick.dataset, answers=answers), monkeypatch)
+    assert name in refused(replace(quick.dataset, answers=answers))
 
 
 @pytest.mark.fault(97)
@@ -117,7 +120,7 @@ def test_one_given_state_can_be_learnt(quick, linear):
     one = {name: array[:1] for name, array in vars(quick.demonstrations).items()}
     single = replace(changed(quick.dataset, **one), answers=None, probes=None)
     for expert, probes in ((None, 0), (linear, 3)):
-        result = fdtasil.distill(expert, demonstrations=single, probes=probes, **WHOLE)
+        result = fdtasil.distill(expert, dataset=single, probes=probes, **WHOLE)
         assert np.isfinite(result.history[-1]["loss"])
 
 
@@ -139,9 +142,10 @@ def test_a_training_that_diverges_leaves_no_number_that_is_not_finite(
     rate, batch_size, linear, tmp_path, monkeypatch
 ):
     """Checkpoints are taken at every epoch here, the history looks at each hundredth step."""
-    monkeypatch.setattr(runfolder, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr("fdtasil.run.folder.CHECKPOINT_SECONDS", 0.0)
     entries = []
-    run = {**QUICK, "steps": 300, "batch_size": batch_size, "learning_rate": rate}
+    fit = Fit(steps=300, batch_size=batch_size, learning_rate=rate)
+    run = {**QUICK, "fit": fit}
     with pytest.raises(FitError, match=r"at step|after step") as error:
         fdtasil.distill(linear, TOY, 3, out=tmp_path, callback=entries.append, **run)
     assert len(str(error.value).splitlines()) <= 6
@@ -155,12 +159,13 @@ def test_a_training_that_diverges_leaves_no_number_that_is_not_finite(
 
 @pytest.mark.fault(101)
 def test_a_student_that_was_spoilt_is_not_saved(quick, tmp_path):
+    result = copy.deepcopy(quick)
     with torch.no_grad():
-        next(quick.student.parameters())[0, 0] = torch.nan
+        next(result.student.parameters())[0, 0] = torch.nan
     with pytest.raises(fdtasil.FdtasilError, match="not finite"):
-        quick.save(tmp_path / "run")
+        result.save(tmp_path / "run")
     with pytest.raises(fdtasil.FdtasilError, match="not finite"):
-        quick.to_onnx(tmp_path / "student.onnx")
+        result.to_onnx(tmp_path / "student.onnx")
     assert not list(tmp_path.iterdir())
 
 
@@ -196,20 +201,35 @@ def test_a_full_gpu_leaves_a_run_that_goes_on_elsewhere(
 
 
 @pytest.mark.fault(100)
-@pytest.mark.parametrize("after", [1500, 2500, 3000])
-def test_an_expert_that_fails_late_leaves_a_run_that_goes_on(after, linear, tmp_path, monkeypatch):
-    """In the questions of the second round, while training, or in the evaluation."""
-    monkeypatch.setattr(runfolder, "CHECKPOINT_SECONDS", 0.0)
-    run = {**QUICK, "trainer": "dagger", "episodes": 3, "steps": 60, "probes": "sphere:4,resample"}
-    asked = 0
+@pytest.mark.parametrize(
+    ("moment", "newest"),
+    [
+        ("the questions of the second round", "1/recorded-0"),
+        ("training", "1/training-*"),
+        ("the evaluation", "1/trained-0"),
+    ],
+)
+@pytest.mark.usefixtures("many_checkpoints")
+def test_an_expert_that_fails_late_leaves_a_run_that_goes_on(moment, newest, linear, tmp_path):
+    run = {**QUICK, "trainer": "dagger", "episodes": 3, "probes": "sphere:4,resample"}
+    run["fit"] = Fit(steps=60)
+    asked, trained = 0, []
 
     def expert(rows):
         nonlocal asked
         asked += len(rows)
         return linear(rows)
 
-    golden = fdtasil.distill(expert, TOY, out=tmp_path / "golden", **run)
-    assert asked > after
+    def note(event):
+        if event.kind == "round":
+            trained.append(asked)
+
+    golden = fdtasil.distill(expert, TOY, out=tmp_path / "golden", callback=note, **run)
+    after = {
+        "the questions of the second round": trained[0] + 60,  # 40 of them act
+        "training": trained[1] - 60,
+        "the evaluation": trained[1] + 10,
+    }[moment]
     good, asked = expert, 0
 
     def failing(rows):
@@ -219,6 +239,8 @@ def test_an_expert_that_fails_late_leaves_a_run_that_goes_on(after, linear, tmp_
     failing.__name__ = "expert"
     with pytest.raises(ExpertError, match="expert is not finite on"):
         fdtasil.distill(failing, TOY, out=tmp_path / "run", **run)
+    kept = sorted((tmp_path / "run/checkpoints").glob("*/*"), key=lambda p: p.stat().st_mtime)
+    assert kept[-1].match(newest)
     assert all(torch.isfinite(tensor).all() for _, tensor in tensors_of(tmp_path))
     result = fdtasil.distill(expert, TOY, resume=tmp_path / "run", **run)
     assert result.student.to_bytes() == golden.student.to_bytes()
@@ -252,7 +274,6 @@ def test_a_misspelt_argument_is_named_and_nothing_is_asked():
         ({"probes": "spere:3"}, "sphere"),
         ({"trainer": "dager"}, "dagger"),
         ({"preset": "standart"}, "standard"),
-        ({"activation": "gellu"}, "gelu"),
         ({"device": "cqu"}, "cpu"),
     ],
 )
@@ -265,3 +286,12 @@ def test_a_misspelt_word_is_shown_the_known_ones(wrong, known):
     (word,) = wrong.values()
     assert word in error.value.found
     assert known in str(error.value)
+
+
+@pytest.mark.fault(107)
+def test_a_misspelt_setting_of_an_object_is_shown_the_known_ones():
+    with pytest.raises(SettingError, match="activation='gellu'") as error:
+        Mlp(16, "gellu")
+    assert "gelu" in error.value.expected
+    with pytest.raises(TypeError, match="unexpected keyword argument 'stepz'"):
+        Fit(stepz=3)
