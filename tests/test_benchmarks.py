@@ -134,7 +134,7 @@ def test_the_shell(tmp_path):
 
 
 def test_the_quality_table_pairs_equal_seeds(tmp_path):
-    from benchmarks.quality import QUALITY
+    from benchmarks.quality import BENCHMARK
 
     rows = [
         {
@@ -149,7 +149,7 @@ def test_the_quality_table_pairs_equal_seeds(tmp_path):
         for p in (10, 0)
         for s in range(2)
     ]
-    table = QUALITY.draw(json.loads(json.dumps(rows)))["quality.md"].decode()
+    table = BENCHMARK.draw(json.loads(json.dumps(rows)))["quality.md"].decode()
     assert "| e | 5 x 300 | 0.55" in table
     assert "+0.350" in table
 
@@ -230,20 +230,18 @@ def test_distillations_are_sent_to_other_processes(tmp_path):
 
 
 def test_the_same_distillation_is_found_in_several_benchmarks():
-    from benchmarks.finite_difference import FINITE_DIFFERENCE
-    from benchmarks.queries import QUERIES
-    from benchmarks.trainers import MUJOCO
+    from benchmarks.__main__ import BENCHMARKS
 
     def known(benchmark):
         return {json.dumps(benchmark.arguments(c), sort_keys=True) for c in benchmark.cells(False)}
 
-    for benchmark in (QUERIES, MUJOCO):
-        assert known(benchmark) & known(FINITE_DIFFERENCE)
+    for name in ("queries", "mujoco"):
+        assert known(BENCHMARKS[name]) & known(BENCHMARKS["finite_difference"])
 
 
-def test_return_against_questions():
-    """Every purpose counts; a rival is taken at the first of its budgets that asks no less."""
-    from benchmarks.queries import QUERIES
+def test_return_against_queries():
+    """Every purpose counts; a baseline is taken at the first of its budgets that asks no less."""
+    from benchmarks.queries import BENCHMARK
 
     def result(cell):
         acted = 300 * cell["episodes"]
@@ -255,8 +253,8 @@ def test_return_against_questions():
             queries = {"act": acted - 100, "label": 100}
         return {"queries": queries, "normalized_return": score}
 
-    rows = [{"cell": cell, "result": result(cell)} for cell in QUERIES.cells(False)]
-    files = QUERIES.draw(rows)
+    rows = [{"cell": cell, "result": result(cell)} for cell in BENCHMARK.cells(False)]
+    files = BENCHMARK.draw(rows)
     assert files["queries.png"].startswith(b"\x89PNG")
     table = files["queries.md"].decode()
     expert = rows[0]["cell"]["expert"]
@@ -264,9 +262,9 @@ def test_return_against_questions():
     head = f"| {expert} | 10 probes | 2 | 7,608 |"
     assert f"{head} +0.46 [+0.46, +0.46] | +0.42 [+0.42, +0.42] | +0.42 [+0.42, +0.42] |" in table
     assert f"{head} 0.50 [0.50, 0.50] |" in table
-    assert table.count(f"| {expert} | 50 probes | 20 | 307,008 |") == 1  # no rival asks that much
+    assert table.count(f"| {expert} | 50 probes | 20 | 307,008 |") == 1  # none asks that much
     assert f"| {expert} | DAgger | 20 | 6,000 |" in table
-    assert QUERIES.draw(rows[1:60]) == {}
+    assert BENCHMARK.draw(rows[1:60]) == {}
 
 
 def disturbed_row(cell):
@@ -282,7 +280,7 @@ def disturbed_row(cell):
 
 
 def test_what_figures_call_a_method():
-    from benchmarks.finite_difference import label
+    from benchmarks.grid import label
 
     assert label("1") == "1 probe"
     assert label("50") == "50 probes"
@@ -291,10 +289,10 @@ def test_what_figures_call_a_method():
 
 
 def test_a_student_beside_its_expert_under_disturbances():
-    from benchmarks.robustness import ROBUSTNESS
+    from benchmarks.robustness import BENCHMARK
 
-    rows = [disturbed_row(cell) for cell in ROBUSTNESS.cells(False)]
-    files = ROBUSTNESS.draw(rows)
+    rows = [disturbed_row(cell) for cell in BENCHMARK.cells(False)]
+    files = BENCHMARK.draw(rows)
     assert files["robustness.png"].startswith(b"\x89PNG")
     table = files["robustness.md"].decode()
     name = rows[0]["cell"]["expert"]
@@ -304,7 +302,7 @@ def test_a_student_beside_its_expert_under_disturbances():
     assert f"itself: {name} under mass x 1.2" in table
     rows[0]["result"]["noise 0.1"] = {**rows[0]["result"]["none"], "expert_return": 7.0}
     with pytest.raises(ValueError, match="the expert differs"):
-        ROBUSTNESS.draw(rows)
+        BENCHMARK.draw(rows)
 
 
 @pytest.mark.slow

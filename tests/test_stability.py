@@ -8,7 +8,7 @@ import torch
 
 pytest.importorskip("joblib", reason="needs the extra: pip install 'fdtasil[bench]'")
 
-from benchmarks.stability import NUS, SOURCES, STABILITY, follow_student
+from benchmarks.stability import BENCHMARK, NUS, SOURCES, follow_student
 from benchmarks.stability_table import breaks_at
 from benchmarks.synthetic_system import SIZE, SyntheticSystem, advance, as_function, make_expert
 from fdtasil import load_expert
@@ -87,7 +87,7 @@ def test_a_constant_error_ends_where_gamma_says():
     ("order", "source"), [(0, "none"), (1, "differences"), (2, "differences"), (2, "jacobian")]
 )
 def test_a_tiny_cell_runs(order, source):
-    result = STABILITY.run({"order": order, "source": source, "seed": 0, "steps": 3}, "cpu")
+    result = BENCHMARK.run({"order": order, "source": source, "seed": 0, "steps": 3}, "cpu")
     assert json.loads(json.dumps(result, allow_nan=False)) == result
     assert len(result["fresh"]["gap"]["median"]) == len(result["nus"]) == len(NUS)
     assert (result["derivative_error"] > 0) == (order > 0)
@@ -112,8 +112,8 @@ def row(order, source, seed):
 
 def test_the_figure_and_the_tables_are_drawn_from_any_part_of_a_sweep():
     whole = [row(*key, seed) for seed in range(3) for key in SOURCES]
-    STABILITY.draw(whole[:1])
-    drawn = STABILITY.draw(whole)
+    BENCHMARK.draw(whole[:1])
+    drawn = BENCHMARK.draw(whole)
     assert drawn["stability.png"].startswith(b"\x89PNG")
     table = drawn["stability.md"].decode()
     assert "| 2 | finite differences | 3 | 1/3 |" in table
