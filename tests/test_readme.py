@@ -1,6 +1,7 @@
 """What the README says works, as it is written there."""
 
 import re
+from importlib import import_module
 from pathlib import Path
 
 import pytest
@@ -27,6 +28,8 @@ def test_the_code_runs(tmp_path, monkeypatch):
 @pytest.mark.parametrize("line", re.findall(r"^fdtasil .*$", README, re.MULTILINE))
 def test_the_commands_exist(line):
     _, command, *arguments = line.split()
-    known = COMMANDS[command].__annotations__
+    assert command in COMMANDS
+    module = import_module(f"fdtasil.shell.{command.replace('-', '_')}")
+    known = module.command.__annotations__
     flags = [a.removeprefix("--").replace("-", "_") for a in arguments if a.startswith("--")]
     assert set(flags) <= set(known)
