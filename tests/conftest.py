@@ -1,5 +1,8 @@
 """Toy experts with known derivatives, and ONNX files as users have them."""
 
+import subprocess
+import sys
+import warnings
 from collections import Counter
 from itertools import pairwise
 from pathlib import Path
@@ -13,7 +16,9 @@ from onnx import TensorProto, helper, numpy_helper
 from toy_environments import Integrator
 
 import fdtasil
+from fdtasil.errors import FdtasilWarning
 from fdtasil.run.folder import RunFolder
+from fdtasil.shell.main import main
 
 GAIN = np.array([[-0.5, 0.1, -0.7, 0.0, 0.0], [0.0, -0.4, 0.1, -0.6, 0.0]], np.float32)
 TOY = "toy_environments:toy/Integrator-v0"
@@ -183,6 +188,28 @@ def many_checkpoints(monkeypatch):
         return folder._path is not None and asked[id(folder)] % 21 == 0
 
     monkeypatch.setattr(RunFolder, "due", property(due))
+
+
+@pytest.fixture
+def inside(monkeypatch, capsys):
+    """Run the command line in this process: `shells.shell` starts one, which takes seconds."""
+
+    def run(*arguments, cwd="."):
+        line = ["fdtasil", *map(str, arguments)]
+        capsys.readouterr()
+        with monkeypatch.context() as patch, warnings.catch_warnings():
+            warnings.simplefilter("default", FdtasilWarning)  # an error in other tests
+            patch.setattr(sys, "argv", line)
+            patch.chdir(cwd)
+            code = 0
+            try:
+                main()
+            except SystemExit as error:
+                code = error.code or 0
+        shown = capsys.readouterr()
+        return subprocess.CompletedProcess(line, code, shown.out, shown.err)
+
+    return run
 
 
 @pytest.fixture

@@ -5,6 +5,7 @@ import signal
 import subprocess
 import sys
 import time
+from dataclasses import fields
 from pathlib import Path
 
 import pytest
@@ -14,7 +15,12 @@ import fdtasil
 from fdtasil.errors import ExpertError, FitError
 from fdtasil.shell.beside import evaluated_beside
 
-ENDLESS = {**QUICK, "steps": 10**7}
+# As the shell has them, where most are left out.
+SHORT = {field.name: None for part in (fdtasil.Fit, fdtasil.Mlp) for field in fields(part)}
+SHORT |= {"output": None, "trust": None, "log_formats": (), "out": None, "resume": None}
+SHORT |= {"preset": "standard", "steps": 40, "hidden": (16,)}
+SHORT |= {name: QUICK[name] for name in ("episodes", "horizon", "evaluation_episodes")}
+ENDLESS = {"steps": 10**7}
 
 
 @pytest.fixture
@@ -22,7 +28,7 @@ def run(tmp_path, monkeypatch):
     """Arguments of a quick cloning, from a folder with a file that nobody may import."""
     monkeypatch.chdir(tmp_path)
     (tmp_path / "safetensors.py").write_text("raise SystemExit(9)\n")
-    return {"expert": str(mlp_onnx(tmp_path / "e.onnx")), "env": TOY, "probes": 0, **QUICK}
+    return {**SHORT, "expert": str(mlp_onnx(tmp_path / "e.onnx")), "env": TOY, "probes": 0}
 
 
 @pytest.fixture
@@ -44,7 +50,7 @@ def test_the_evaluation_is_that_of_the_same_call(run, tmp_path):
     loud = "import toy_environments\nprint('much ' * 99)\nimport os\nos.write(1, b'noise')\n"
     (tmp_path / "loud.py").write_text(loud)
     with evaluated_beside({**run, "env": "loud:toy/Integrator-v0"}) as cloning:
-        expected = fdtasil.distill(**run, progress=False).evaluation
+        expected = fdtasil.distill(run["expert"], TOY, 0, **QUICK).evaluation
         assert cloning() == expected
 
 

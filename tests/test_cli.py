@@ -5,13 +5,18 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import fields
+from importlib import import_module
 
 import numpy as np
 import pytest
 import torch
 from conftest import TOY, mlp_onnx
+from shells import shell
 
 import fdtasil
+from fdtasil import Fit, Mlp
+from fdtasil.run.presets import preset_of
 from fdtasil.shell.main import COMMANDS
 
 QUICK = [
@@ -26,28 +31,114 @@ QUICK = [
     "--evaluation-episodes",
     "2",
 ]
+SETTINGS = {field.name for part in (Fit, Mlp) for field in fields(part)}
+
+pytestmark = pytest.mark.usefixtures("no_pictures")
 
 
-def shell(*arguments, cwd="."):
-    environment = {**os.environ, "PYTHONPATH": os.path.dirname(__file__)}
-    command = [sys.executable, "-m", "fdtasil", *map(str, arguments)]
-    return subprocess.run(command, capture_output=True, text=True, cwd=cwd, env=environment)
+@pytest.fixture(scope="module")
+def expert(tmp_path_factory):
+    return mlp_onnx(tmp_path_factory.mktemp("expert") / "e.onnx")
+
+
+# --- arguments
 
 
 @pytest.mark.parametrize("name", ["distill", "evaluate"])
 def test_the_shell_has_the_functions_arguments_and_defaults(name):
     function = inspect.signature(getattr(fdtasil, name)).parameters
-    command = inspect.signature(COMMANDS[name]).parameters
-    assert set(function) - set(command) <= {"progress", "callback"}
-    assert set(command) - set(function) <= {"out", "compare"}
+    command = inspect.signature(import_module(f"fdtasil.shell.{name}").command).parameters
+    assert set(function) - set(command) <= {"progress", "callback", "student", "fit"}
+    added = {"output", "trust"}
+    if name == "distill":
+        added |= {"out", "baseline", "log_formats"} | SETTINGS
+    assert set(command) - set(function) <= added
     for argument in set(function) & set(command):
         default = function[argument].default
         # A shell's run is always saved; one that goes on stays on its device.
         if argument not in ("out", "device"):
             assert command[argument].default in (default, str(default))
+    for argument in added - {"out", "baseline", "log_formats"}:
+        assert command[argument].default is None
 
 
-def test_a_stable_baselines3_agent_becomes_an_expert(tmp_path):
+@pytest.fixture
+def called(monkeypatch):
+    """The arguments that `distill` is called with; it does nothing else."""
+    found = {}
+
+    def note(**arguments):
+        found.update(arguments)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("fdtasil.shell.call.distill", note)
+    return found
+
+
+def test_what_is_left_out_in_a_shell_is_left_to_the_function(called, inside, tmp_path):
+    assert inside("distill", "e.onnx", TOY, cwd=tmp_path).returncode == 130
+    function = inspect.signature(fdtasil.distill).parameters
+    expected = {name: p.default for name, p in function.items() if name in called}
+    expected |= {"expert": "e.onnx", "env": TOY, "fit": Fit()}
+    found = {**called, "out": str(called["out"])}
+    assert found == {**expected, "out": "runs/latest"}
+
+
+def test_what_is_said_in_a_shell_is_what_the_function_is_given(called, inside, tmp_path):
+    said = ["--hidden", "8", "4", "--activation", "tanh", "--steps", "7", "--order", "2"]
+    said += ["--weight-decay", "0.5", "--probes", "10,central", "--preset", "paper"]
+    said += ["--student-obs", "2", "0", "--dataset", "there", "--out", "run"]
+    said += ["--log-formats", "csv", "json"]
+    assert inside("distill", "e.onnx", TOY, *said, cwd=tmp_path).returncode == 130
+    assert called["student"] == Mlp((8, 4), "tanh")
+    paper = preset_of("paper")
+    assert called["fit"] == paper.fit_with(steps=7, order=2, weight_decay=0.5)
+    assert called["fit"].epsilon == paper.fit.epsilon != Fit().epsilon
+    assert (called["probes"], called["preset"]) == ("10,central", "paper")
+    assert (called["student_obs"], called["dataset"]) == ((2, 0), "there")
+    assert isinstance(called["callback"], fdtasil.Log)
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_argument_is_explained(name, inside, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "120")
+    module = import_module(f"fdtasil.shell.{name.replace('-', '_')}")
+    shown = inside(name, "--help")
+    assert shown.returncode == 0
+    text = " ".join(shown.stdout.replace("│", " ").split())
+    for argument, parameter in inspect.signature(module.command).parameters.items():
+        if parameter.kind is not inspect.Parameter.POSITIONAL_ONLY:
+            flag = f"--{argument.replace('_', '-')}"
+            assert flag in text or argument in ("expert", "env", "policy", "agent_zip"), argument
+    if name == "distill":
+        assert "States in a minibatch at most" in text
+        assert "Width of each hidden layer" in text
+        assert "Name of the ONNX output" in text
+
+
+# --- what commands do
+
+
+def test_inspect_distill_evaluate(expert, tmp_path):
+    """In processes of their own, as a user has them."""
+    shown = shell("inspect", expert, TOY, "--episodes", 2)
+    assert shown.returncode == 0, shown.stderr
+    for promised in ("sha256", "determinism", "batch independence", "action bounds", "return"):
+        assert promised in shown.stdout
+    done = shell("distill", expert, TOY, *QUICK, "--baseline", "--out", tmp_path / "run")
+    assert done.returncode == 0, done.stderr
+    assert done.stderr == ""  # no terminal, no bars
+    for promised in ("expert", "plain cloning", "student", "queries: "):
+        assert promised in done.stdout
+    report = json.loads((tmp_path / "run" / "report.json").read_text())
+    assert report["queries"]["probe"] == 400
+    assert (tmp_path / "run" / "figures" / "training.png").read_bytes().startswith(b"\x89PNG")
+    judged = shell("evaluate", tmp_path / "run" / "student.onnx", TOY, "--expert", expert)
+    assert judged.returncode == 0, judged.stderr
+    assert "normalised return" in judged.stdout
+
+
+def test_a_stable_baselines3_agent_becomes_an_expert(inside, tmp_path):
     from stable_baselines3 import SAC
 
     state = torch.get_rng_state(), np.random.get_state()
@@ -55,30 +146,55 @@ def test_a_stable_baselines3_agent_becomes_an_expert(tmp_path):
     torch.set_rng_state(state[0])
     np.random.set_state(state[1])
     exported = ["export-sb3", "agent.zip", "--env", "Pendulum-v1", "--out", "agent.onnx"]
-    done = shell(*exported, cwd=tmp_path)
+    done = inside(*exported, cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     for expert in ("agent.zip", "agent.onnx"):
-        shown = shell("inspect", expert, "Pendulum-v1", "--episodes", 1, cwd=tmp_path)
+        shown = inside("inspect", expert, "Pendulum-v1", "--episodes", 1, cwd=tmp_path)
         assert shown.returncode == 0, shown.stderr
         assert "a torch twin agrees with it" in shown.stdout
 
 
-def test_inspect_distill_evaluate(tmp_path):
-    expert = mlp_onnx(tmp_path / "e.onnx")
-    shown = shell("inspect", expert, TOY, "--episodes", 2)
-    assert shown.returncode == 0, shown.stderr
-    for promised in ("sha256", "determinism", "batch independence", "action bounds", "return"):
-        assert promised in shown.stdout
-    done = shell("distill", expert, TOY, *QUICK, "--compare", "--out", tmp_path / "run")
+def test_logs_are_written_beside_a_run(expert, inside, tmp_path):
+    done = inside(
+        "distill", expert, TOY, *QUICK, "--log-formats", "csv", "--out", tmp_path / "run"
+    )
     assert done.returncode == 0, done.stderr
-    assert done.stderr == ""  # no terminal, no bars
-    for promised in ("expert", "plain cloning", "student", "rows asked of the expert"):
-        assert promised in done.stdout
+    assert "train/loss" in (tmp_path / "run" / "log" / "progress.csv").read_text()
+
+
+def test_options_of_the_expert_are_told(inside, tmp_path):
+    expert = mlp_onnx(tmp_path / "e.onnx", sizes=(5, 8, 2), extra_outputs={"other": 2})
+    unnamed = inside("inspect", expert, TOY, "--episodes", 1)
+    assert unnamed.returncode == 1
+    assert "output=" in unnamed.stderr
+    named = ("--output", "other")
+    for command in (
+        ("inspect", expert, TOY, "--episodes", 1, *named),
+        ("distill", expert, TOY, *QUICK, *named, "--out", tmp_path / "run"),
+        ("evaluate", tmp_path / "run" / "student.onnx", TOY, "--expert", expert, *named),
+    ):
+        done = inside(*command)
+        assert done.returncode == 0, done.stderr
+
+
+def test_stored_probes_need_not_be_repeated(linear, inside, tmp_path):
+    """Their number is another than the usual one, which is taken where nothing is stored."""
+    quick = {"episodes": 2, "horizon": 20, "evaluation_episodes": 0}
+    stored = fdtasil.distill(linear, TOY, "sphere:5", **quick, student=Mlp(4), fit=Fit(steps=5))
+    stored.save(tmp_path / "stored")
+    short = ["--dataset", tmp_path / "stored", "--steps", 30, "--hidden", 4]
+    done = inside("distill", *short, "--out", tmp_path / "run")
+    assert done.returncode == 0, done.stderr
     report = json.loads((tmp_path / "run" / "report.json").read_text())
-    assert report["queries"]["probe"] == 400
-    judged = shell("evaluate", tmp_path / "run" / "student.onnx", TOY, "--expert", expert)
-    assert judged.returncode == 0, judged.stderr
-    assert "normalised return" in judged.stdout
+    assert report["probes"] == stored.report["probes"]
+    assert report["probes"].startswith("sphere:5,")
+    assert sum(report["queries"].values()) == 0
+    refused = inside("distill", *short, "--probes", 10, "--out", tmp_path / "other")
+    assert refused.returncode == 2
+    assert "with stored answers to 'sphere:5," in refused.stderr
+
+
+# --- errors
 
 
 @pytest.mark.parametrize(
@@ -93,11 +209,15 @@ def test_inspect_distill_evaluate(tmp_path):
             ["distill", "EXPERT", TOY, "--prbes", "3"], 2, "--probes", marks=pytest.mark.fault(107)
         ),
         (["distil"], 2, "distill"),
+        ([], 2, "no command"),
+        (["distill", "EXPERT", TOY, "--activation", "gellu"], 2, "activation='gellu'"),
+        (["distill", "EXPERT", TOY, "--steps", "0"], 2, "steps=0"),
     ],
 )
-def test_an_error_is_short_and_says_the_next_step(arguments, code, found, tmp_path):
-    expert = str(mlp_onnx(tmp_path / "e.onnx"))
-    failed = shell(*[expert if a == "EXPERT" else a for a in arguments], cwd=tmp_path)
+def test_an_error_is_short_and_says_the_next_step(
+    arguments, code, found, expert, inside, tmp_path
+):
+    failed = inside(*[expert if a == "EXPERT" else a for a in arguments], cwd=tmp_path)
     assert failed.returncode == code
     assert found in failed.stderr + failed.stdout
     assert "Traceback" not in failed.stderr
@@ -106,34 +226,81 @@ def test_an_error_is_short_and_says_the_next_step(arguments, code, found, tmp_pa
         assert "next step" in failed.stderr
 
 
-def test_a_run_goes_on_as_it_was_begun_and_a_failed_call_changes_nothing(tmp_path):
-    expert = mlp_onnx(tmp_path / "e.onnx")
-    failed = shell("distill", tmp_path / "none.onnx", TOY, *QUICK, "--out", tmp_path / "run")
+@pytest.mark.parametrize(
+    ("arguments", "code"), [(["none.onnx", TOY], 1), (["none.onnx", TOY, "--probes", "x"], 2)]
+)
+def test_a_process_ends_with_the_code_of_its_error(arguments, code, tmp_path):
+    failed = shell("distill", *arguments, cwd=tmp_path)
+    assert failed.returncode == code
+    assert failed.stdout == ""
+    assert failed.stderr.startswith("fdtasil: ")
+    assert "next step: " in failed.stderr
+    assert "Traceback" not in failed.stderr
+
+
+# --- runs that go on
+
+
+def test_a_run_goes_on_as_it_was_begun_and_a_failed_call_changes_nothing(
+    expert, inside, tmp_path
+):
+    failed = inside("distill", tmp_path / "none.onnx", TOY, *QUICK, "--out", tmp_path / "run")
     assert failed.returncode == 1
     assert not (tmp_path / "run").exists()
-    assert shell("distill", expert, TOY, *QUICK, "--out", tmp_path / "run").returncode == 0
+    assert inside("distill", expert, TOY, *QUICK, "--out", tmp_path / "run").returncode == 0
     before = (tmp_path / "run/command.json").read_bytes()
-    shell("distill", tmp_path / "none.onnx", TOY, *QUICK, "--out", tmp_path / "run")
+    inside("distill", tmp_path / "none.onnx", TOY, *QUICK, "--out", tmp_path / "run")
     assert (tmp_path / "run/command.json").read_bytes() == before
-    other = shell("distill", "--resume", tmp_path / "run", "--seed", "7")
+    other = inside("distill", "--resume", tmp_path / "run", "--seed", "7")
     assert other.returncode == 2
     assert "--seed beside --resume" in other.stderr
-    replacing = shell("distill", expert, TOY, *QUICK, "--seed", 1, "--out", tmp_path / "run")
+    replacing = inside("distill", expert, TOY, *QUICK, "--seed", 1, "--out", tmp_path / "run")
     assert "which this one replaces" in replacing.stderr
 
 
-def test_a_run_goes_on_where_it_was_begun_or_where_it_is_told_to(tmp_path):
+def test_a_run_is_resumed_with_nothing_but_its_folder(expert, inside, tmp_path, monkeypatch):
+    """The arguments are those that it was begun with; the bytes those of a run left alone."""
+    import fdtasil.shell.call
+
+    class Stop(fdtasil.FdtasilError):
+        pass
+
+    def stop(event):
+        raise Stop("a stop", "none", "go on")
+
+    def stopped(**arguments):
+        return fdtasil.distill(**{**arguments, "callback": stop})
+
+    environment = "Pendulum-v1"  # which no module has to be imported for
+    expert = mlp_onnx(tmp_path / "swing.onnx", sizes=(3, 8, 1))
+    begun = ["distill", expert, environment, *QUICK, "--activation", "tanh"]
+    assert inside(*begun, "--out", tmp_path / "whole").returncode == 0
+    with monkeypatch.context() as patch:
+        patch.setattr(fdtasil.shell.call, "distill", stopped)
+        failed = inside(*begun, "--out", tmp_path / "run")
+    assert failed.returncode == 1
+    assert f"--resume {tmp_path / 'run'}" in failed.stderr
+    resumed = inside("distill", "--resume", tmp_path / "run")
+    assert resumed.returncode == 0, resumed.stderr
+    for name in ("student.safetensors", "student.onnx", "config.json"):
+        found, expected = ((tmp_path / run / name).read_bytes() for run in ("run", "whole"))
+        assert found == expected, name
+
+
+def test_a_run_goes_on_where_it_was_begun_or_where_it_is_told_to(inside, tmp_path):
     begun = {"expert": "e.onnx", "env": "Pendulum-v1", "trust": None, "device": "tpu"}
     (tmp_path / "command.json").write_text(json.dumps(begun))
     for arguments, found in {(): "device='tpu'", ("--device", "npu"): "device='npu'"}.items():
-        refused = shell("distill", "--resume", tmp_path, *arguments)
+        refused = inside("distill", "--resume", tmp_path, *arguments)
         assert refused.returncode == 2
         assert found in refused.stderr
 
 
-def test_a_module_of_the_current_folder_and_a_warning_without_source(tmp_path):
+# --- surroundings
+
+
+def test_a_module_of_the_current_folder_and_a_warning_without_source(expert, tmp_path):
     """As the installed command, which does not look into the current folder by itself."""
-    expert = mlp_onnx(tmp_path / "e.onnx")
     (tmp_path / "mine.py").write_text(
         "import gymnasium, toy_environments as toys\n"
         "gymnasium.register('My-v0', entry_point=toys.Integrator, max_episode_steps=15)\n"
@@ -147,13 +314,20 @@ def test_a_module_of_the_current_folder_and_a_warning_without_source(tmp_path):
     assert line.startswith("fdtasil: warning: horizon=20")
 
 
+def test_a_warning_is_one_line(expert, inside, tmp_path):
+    short = ["--episodes", 1, "--horizon", 50]
+    done = inside("evaluate", expert, TOY, "--expert", expert, *short, cwd=tmp_path)
+    assert done.returncode == 0
+    (line,) = done.stderr.splitlines()
+    assert line.startswith("fdtasil: warning: horizon=50")
+
+
 def test_the_version_is_told():
     assert shell("--version").stdout == f"fdtasil {fdtasil.__version__}\n"
 
 
-def test_no_other_file_of_the_current_folder_is_run(tmp_path):
+def test_no_other_file_of_the_current_folder_is_run(expert, tmp_path):
     """Optional modules that dependencies look for may lie in a folder that was downloaded."""
-    expert = mlp_onnx(tmp_path / "e.onnx")
     for name in ("glfw_preview", "cffi", "tensorboard"):
         (tmp_path / f"{name}.py").write_text("print('CODE OF THE FOLDER')")
     start = "import sys; sys.path.remove(''); from fdtasil.shell.main import main; main()"

@@ -12,7 +12,7 @@ import onnx
 import pytest
 from conftest import QUICK, TOY, mlp_onnx
 from hub_stand_in import Repository, stand_in
-from test_cli import shell
+from shells import shell
 
 import fdtasil
 from fdtasil.errors import ExpertError, SettingError
@@ -399,11 +399,11 @@ def test_a_token_is_sent_where_one_is_configured_and_not_to_the_store(hub, surro
 # --- a shell
 
 
-def test_inspect_and_evaluate(hub):
-    shown = shell("inspect", WALKER, TOY, "--episodes", 1)
+def test_inspect_and_evaluate(hub, inside):
+    shown = inside("inspect", WALKER, TOY, "--episodes", 1)
     assert shown.returncode == 0, shown.stderr
     assert WALKER in shown.stdout
-    judged = shell("evaluate", WALKER, TOY, "--expert", WALKER, "--episodes", 2, "--horizon", 20)
+    judged = inside("evaluate", WALKER, TOY, "--expert", WALKER, "--episodes", 2, "--horizon", 20)
     assert judged.returncode == 0, judged.stderr
     assert "normalised return" in judged.stdout
 

@@ -17,6 +17,7 @@ def test_the_code_runs(tmp_path, monkeypatch):
     """All blocks in turn, as one session, in an empty folder beside the experts."""
     (tmp_path / "experts").symlink_to(ROOT / "experts")
     monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("fdtasil.student.fit._USUAL_STEPS", 200)  # for the same files
     session = {}
     for block in BLOCKS:
         exec(compile(block, "README.md", "exec"), session)
