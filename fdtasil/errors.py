@@ -2,8 +2,11 @@
 
 import contextlib
 import os
+import re
 import sys
 import warnings
+from collections.abc import Iterator
+from contextvars import ContextVar
 from pathlib import Path
 
 __all__ = [
@@ -16,8 +19,11 @@ __all__ = [
     "SettingError",
     "StorageError",
     "first_line",
+    "heard_warnings",
+    "printable",
     "shown",
     "warn",
+    "without_secrets",
 ]
 
 # Frames that are no caller's: the library's own, and those of its context managers.
@@ -40,9 +46,11 @@ class FdtasilError(Exception):
     """
 
     def __init__(self, found: str, expected: str, next_step: str) -> None:
+        # Whatever a file, a server or a user's code put into it: a terminal must not obey it.
+        parts = [printable(part) for part in (found, expected, next_step)]
         # All three go to Exception.args, so that the error survives pickling between processes.
-        super().__init__(found, expected, next_step)
-        self.found, self.expected, self.next_step = found, expected, next_step
+        super().__init__(*parts)
+        self.found, self.expected, self.next_step = parts
 
     def __str__(self) -> str:
         return f"{self.found}\n  expected: {self.expected}\n  next step: {self.next_step}"
@@ -80,22 +88,81 @@ class FdtasilWarning(UserWarning):
 
 
 def warn(message: str) -> None:
-    """Warn with the line of the caller's own code that led here, however deep that is."""
-    frame, level = sys._getframe(1), 2
-    while frame.f_back is not None and frame.f_code.co_filename.startswith(_OURS):
-        frame, level = frame.f_back, level + 1
-    warnings.warn(message, FdtasilWarning, stacklevel=level)
+    """Warn with the line of the caller's own code that led here, however deep that is.
 
-
-def first_line(error: Exception) -> str:
-    """Return the start of an error's message, for a message of ours."""
-    return shown((str(error).strip().splitlines() or [type(error).__name__])[0])
-
-
-def shown(text: object) -> str:
-    """Return text from a file as one short printable line, for a message of ours.
-
-    A file may hold line breaks, megabytes, and the control characters of a terminal.
+    It is shown each time, where the caller's filters let it, and heard by `heard_warnings`.
     """
-    line = "".join(character if character.isprintable() else "?" for character in str(text)[:201])
+    message = printable(message)
+    for heard in _HEARD.get():
+        heard.append(message)
+    frame = sys._getframe(1)
+    while frame.f_back is not None and frame.f_code.co_filename.startswith(_OURS):
+        frame = frame.f_back
+    module = frame.f_globals.get("__name__")
+    warnings.warn_explicit(
+        message, FdtasilWarning, frame.f_code.co_filename, frame.f_lineno, module
+    )
+
+
+@contextlib.contextmanager
+def heard_warnings() -> Iterator[list[str]]:
+    """Keep the library's warnings of this thread in a list, besides showing them."""
+    heard: list[str] = []
+    token = _HEARD.set((*_HEARD.get(), heard))
+    try:
+        yield heard
+    finally:
+        _HEARD.reset(token)
+
+
+_HEARD: ContextVar[tuple[list[str], ...]] = ContextVar("heard", default=())
+
+
+def first_line(error: BaseException) -> str:
+    """Return the start of an error's message, for a message of ours; its type where it has none."""
+    lines = _text(error).strip().splitlines() or [type(error).__name__]
+    return shown(lines[0])
+
+
+def shown(value: object) -> str:
+    """Return what came from outside as one short printable line, for a message of ours.
+
+    Everything passes here that is not ours: texts of files, of servers and of environments, names,
+    exceptions of a user's code. They may hold line breaks, megabytes, and the control characters
+    of a terminal; the text of an object may even raise.
+    """
+    line = "".join(c if c.isprintable() else "?" for c in _text(value)[:201])
     return line if len(line) <= 200 else f"{line[:197]}..."
+
+
+def printable(text: str) -> str:
+    """Return a text with "?" for what a terminal would obey; its lines stay lines."""
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() or c == "\n" else "?" for c in text)
+
+
+def without_secrets(address: str) -> str:
+    """Return an address without user, password, query and fragment, however malformed it is.
+
+    Args:
+        address: A URL, or any other text, which is returned as it is.
+
+    Example:
+        >>> without_secrets("https://me:word@host/act?api_key=1")
+        'https://host/act'
+    """
+    found = re.match(r"(?is)\s*(https?:/*)(.*)", address)
+    if found is None:
+        return address
+    plain = re.split(r"[?#]", found[2], maxsplit=1)[0].rpartition("@")[2]
+    # A password may hold what ends a host: what does not look like a host is not shown.
+    host = re.match(r"(\[[\w:.%]*\]?|[^:/]*)(:\d*)?(/|$)", plain)
+    return found[1] + (plain if host else "...")
+
+
+def _text(value: object) -> str:
+    try:
+        return str(value)
+    except Exception as error:  # an exception of a user's code whose text raises
+        return f"{type(value).__name__} (its text raises {type(error).__name__})"
