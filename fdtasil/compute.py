@@ -1,15 +1,16 @@
 """How torch computes on this machine: threads, matrix products and the device."""
 
 import re
+import threading
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 
 import numpy as np
 import torch
 
 from fdtasil.errors import FitError, SettingError
 
-__all__ = ["ask_module", "pick_device", "torch_settings"]
+__all__ = ["ask_module", "in_turn", "pick_device", "torch_settings", "usual_modes"]
 
 # "medium" sends float32 products through oneDNN, twice as fast on AMD CPUs as the default and
 # as exact there; a chip with bfloat16 matrix units may round for real, which this bound catches.
@@ -55,10 +56,46 @@ def pick_device(device: str) -> torch.device:
 
 
 @contextmanager
-def torch_settings(device: torch.device, threads: int = 1) -> Iterator[str]:
-    """Compute with `threads` threads and the fastest exact matrix product, then restore both.
+def in_turn() -> Iterator[None]:
+    """Wait until no other thread is inside such a block, for what a process has only once.
 
-    Small networks are faster on one thread, and several runs at once are far faster so.
+    Torch's threads and precision, and the simulator's warnings, are those of the whole process: two
+    runs at once would have each other's, and other bytes. A thread may enter again.
+    """
+    while not _TURN.acquire(timeout=0.2):  # so that Ctrl-C is heard
+        pass
+    try:
+        yield
+    finally:
+        _TURN.release()
+
+
+_TURN = threading.RLock()
+
+
+@contextmanager
+def usual_modes() -> Iterator[None]:
+    """Compute as torch does by itself, whatever modes this thread of the caller's is in.
+
+    The caller may have chosen no gradients, inference, mixed precision, or the device "meta".
+    """
+    with ExitStack() as modes:
+        modes.enter_context(torch.inference_mode(False))
+        modes.enter_context(torch.enable_grad())
+        modes.enter_context(torch.autocast("cpu", enabled=False))
+        if torch.cuda.is_available():
+            modes.enter_context(torch.autocast("cuda", enabled=False))
+        if torch.get_default_device().type != "cpu":  # a mode of its own makes all calls slower
+            modes.enter_context(torch.device("cpu"))
+        yield
+
+
+@contextmanager
+def torch_settings(device: torch.device, threads: int = 1) -> Iterator[str]:
+    """Compute in turn, with `threads` threads and the fastest exact matrix product.
+
+    Small networks are faster on one thread, and several runs at once are far faster so. What the
+    caller has set is there again after the block.
 
     Args:
         device: Where is computed; the product is measured there.
@@ -71,29 +108,36 @@ def torch_settings(device: torch.device, threads: int = 1) -> Iterator[str]:
     Raises:
         FitError: If the GPU has no memory left, here or inside the block.
     """
-    before_threads, before_precision = (
-        torch.get_num_threads(),
-        torch.get_float32_matmul_precision(),
-    )
-    torch.set_num_threads(threads)
-    try:
-        torch.set_float32_matmul_precision("medium")
-        if _product_error(device) > _ACCEPTED_ERROR:
+    with in_turn(), usual_modes():
+        before_threads, before_type = torch.get_num_threads(), torch.get_default_dtype()
+        before_precision = torch.get_float32_matmul_precision()
+        torch.set_num_threads(threads)
+        torch.set_default_dtype(torch.float32)
+        try:
+            # Of GPUs too, where it rounds, and where the caller may compute beside this run.
+            if not torch.cuda.is_available():
+                torch.set_float32_matmul_precision("medium")
+            if _product_error(device) > _ACCEPTED_ERROR:
+                torch.set_float32_matmul_precision(before_precision)
+            yield torch.get_float32_matmul_precision()
+        except RuntimeError as error:
+            # Without room for CUDA itself, or for its libraries, the error is of another class.
+            if not _FULL.search(str(error)):
+                raise
+            raise _full(error) from error
+        finally:
             torch.set_float32_matmul_precision(before_precision)
-        yield torch.get_float32_matmul_precision()
-    except RuntimeError as error:
-        # Without room for CUDA itself, or for its libraries, the error is of another class.
-        if not _FULL.search(str(error)):
-            raise
-        said = str(error).removeprefix("CUDA out of memory. ").partition(". ")[0]
-        raise FitError(
-            f"no GPU memory left: {said.splitlines()[0]}",
-            "room for all demonstrations, the answers around them and a training step",
-            'end what else uses the GPU, or compute on the CPU: device="cpu"',
-        ) from error
-    finally:
-        torch.set_float32_matmul_precision(before_precision)
-        torch.set_num_threads(before_threads)
+            torch.set_default_dtype(before_type)
+            torch.set_num_threads(before_threads)
+
+
+def _full(error: RuntimeError) -> FitError:
+    said = str(error).removeprefix("CUDA out of memory. ").partition(". ")[0]
+    return FitError(
+        f"no GPU memory left: {said.splitlines()[0]}",
+        "room for all demonstrations, the answers around them and a training step",
+        'end what else uses the GPU, or compute on the CPU: device="cpu"',
+    )
 
 
 def _product_error(device: torch.device) -> float:

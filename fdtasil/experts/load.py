@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from fdtasil.checks import check_count
-from fdtasil.compute import ask_module
+from fdtasil.compute import ask_module, usual_modes
 from fdtasil.errors import ExpertError, FdtasilWarning, SettingError
 from fdtasil.experts.expert import CHUNK, Expert, Hints
 from fdtasil.experts.http_expert import is_http_url, open_http
@@ -90,7 +90,7 @@ def load_expert(
     """
     kind, hints = _kind_of(source), Hints(observation_size, action_size, output, trust, timeout)
     check_workers(workers, threads, timeout, kind.remote)
-    expert = sized(kind.opens(source, hints), observation_size, action_size)
+    expert = sized(open_expert(source, hints), observation_size, action_size)
     if batch is None and workers and expert.chunk == CHUNK:
         batch = BATCH
     if batch is not None:
@@ -104,7 +104,8 @@ def load_expert(
 
 def open_expert(source: ExpertLike, hints: Hints) -> Expert:
     """Open an expert whose sizes may be others than those hinted at; see `load_expert`."""
-    return _kind_of(source).opens(source, hints)
+    with usual_modes():
+        return _kind_of(source).opens(source, hints)
 
 
 def sized(expert: Expert, observation_size: int | None, action_size: int | None) -> Expert:

@@ -9,6 +9,7 @@ import numpy as np
 from fdtasil.errors import warn
 from fdtasil.experts.expert import Expert
 from fdtasil.files.plain import from_plain, to_plain
+from fdtasil.probes.scales import measure_scales
 from fdtasil.progress import Progress
 from fdtasil.rollouts.behaviours import Policy, follow, random_behaviour
 from fdtasil.rollouts.environments import EnvironmentPool
@@ -193,10 +194,8 @@ def _interval(ours: np.ndarray, theirs: np.ndarray, seed: int) -> tuple[float, f
 
 def _imitation_gap(student: Episodes, expert: Episodes) -> float:
     both = student.valid & expert.valid
-    deviation = expert.observations[expert.valid].std(axis=0, dtype=np.float64)
-    live = deviation > 1e-6
-    if not live.any():
-        return 0.0
-    apart = (student.observations - expert.observations)[..., live] / deviation[live]
+    scales = measure_scales(expert.observations[expert.valid])
+    live = scales.live
+    apart = (student.observations - expert.observations)[..., live] / scales.deviation[live]
     distance = np.sqrt((apart**2).mean(axis=-1))
     return float(np.where(both, distance, 0.0).max(axis=1).mean())

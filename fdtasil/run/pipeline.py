@@ -9,7 +9,7 @@ from fdtasil.checks import check_count
 from fdtasil.compute import pick_device, torch_settings
 from fdtasil.demonstrations.dataset import Dataset, DatasetLike, load_dataset
 from fdtasil.demonstrations.trainers import Trainer
-from fdtasil.errors import SettingError
+from fdtasil.errors import SettingError, heard_warnings
 from fdtasil.experts.examination import check_first, examine
 from fdtasil.experts.expert import Hints
 from fdtasil.experts.gate import GATE_STATES
@@ -29,7 +29,7 @@ from fdtasil.run.configuration import Configuration
 from fdtasil.run.events import Callback, Event, tell_all
 from fdtasil.run.folder import open_run_folder
 from fdtasil.run.interrupts import heard_interrupts
-from fdtasil.run.report import config_of, noted_warnings, report_of
+from fdtasil.run.report import config_of, report_of
 from fdtasil.run.rounds import Rounds
 from fdtasil.run.subject import Subject, open_subject
 from fdtasil.run.training import Training
@@ -150,7 +150,7 @@ def distill(
         device=device,
     )
     torch_device, told = pick_device(device), tell_all(callback)
-    with noted_warnings() as notes, open_subject(expert, env, given) as subject:
+    with heard_warnings() as notes, open_subject(expert, env, given) as subject:
         run = arguments.configure(subject)
         run.check_budget()
         with (

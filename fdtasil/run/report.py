@@ -1,21 +1,17 @@
 """What a run says of itself: `config.json`, `report.json`, and the warnings on the way."""
 
 import platform
-import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import replace
 from importlib.metadata import version
 from typing import Any
 
 import fdtasil
-from fdtasil.errors import FdtasilWarning
 from fdtasil.results.evaluation import Evaluation
 from fdtasil.run.checkpoints import Checkpoints
 from fdtasil.run.configuration import Configuration
 from fdtasil.run.lesson import Lesson
 
-__all__ = ["config_of", "noted_warnings", "report_of", "versions"]
+__all__ = ["config_of", "report_of", "versions"]
 
 _VERSIONED = ("torch", "numpy", "gymnasium", "mujoco", "onnx", "onnxruntime")
 
@@ -83,20 +79,3 @@ def report_of(
         "matmul_precision": matmul_precision,
         "warnings": account.notes,
     }
-
-
-@contextmanager
-def noted_warnings() -> Iterator[list[str]]:
-    """Keep the library's warnings in a list as well as showing them, each time they occur."""
-    notes: list[str] = []
-    with warnings.catch_warnings():
-        warnings.filterwarnings("always", category=FdtasilWarning, append=True)
-        shown = warnings.showwarning
-
-        def note(message: Warning | str, category: type[Warning], *where: Any) -> None:
-            if issubclass(category, FdtasilWarning):
-                notes.append(str(message))
-            shown(message, category, *where)
-
-        warnings.showwarning = note  # catch_warnings puts the old one back
-        yield notes

@@ -199,8 +199,11 @@ def fit(
     if resume is not None:
         state.restore(resume)
 
+    # Bounds of +-1, the usual ones, cost nothing.
+    units = student.action_units if bool((student.action_units != 1).any()) else None
+
     def loss_of(batch: Minibatch) -> TaylorLoss:
-        return taylor_loss(student, batch, stencil, weights)
+        return taylor_loss(student, batch, stencil, weights, units)
 
     step = gradient_step(student, optimiser, loss_of, settings.max_gradient_norm, device)
     first_epoch = state.step // per_epoch

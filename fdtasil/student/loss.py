@@ -60,7 +60,7 @@ class TaylorLoss(NamedTuple):
 
     Attributes:
         loss: (), what is minimised.
-        action_error: (), mean norm of the action error.
+        action_error: (), mean norm of the action error, in units of the actions.
         derivative_error: (), mean norm of the error of the first differences, in units of the
             whitened Jacobian's Frobenius norm; 0 without probes.
         curvature_error: (), mean norm of the error of the second differences, in units of z'Hz
@@ -74,7 +74,11 @@ class TaylorLoss(NamedTuple):
 
 
 def taylor_loss(
-    student: nn.Module, batch: Minibatch, stencil: Stencil | None, weights: Weights
+    student: nn.Module,
+    batch: Minibatch,
+    stencil: Stencil | None,
+    weights: Weights,
+    units: Tensor | None = None,
 ) -> TaylorLoss:
     """Compare a student with the expert's answers (TaSIL, equation 5, p = 0, 1, 2; appendix).
 
@@ -87,6 +91,7 @@ def taylor_loss(
         batch: B states with k probes each.
         stencil: How the expert was differenced; None without probes (p = 0).
         weights: Of the terms.
+        units: (m,) that actions are measured in; None for their own.
 
     Example:
         >>> batch = Minibatch(torch.zeros(2, 3), torch.ones(2, 3))
@@ -95,17 +100,17 @@ def taylor_loss(
     """
     probes = batch.probes
     if stencil is None or probes is None:
-        action = _mean_norm(student(batch.observations) - batch.actions)
+        action = _mean_norm(student(batch.observations) - batch.actions, units)
         zero = torch.zeros_like(action)
         return TaylorLoss(action, action, zero, zero)
     errors = _exact_errors if stencil.exact else _difference_errors
     found = errors(student, batch, probes, stencil, second=weights.curvature is not None)
     count = probes.displacements.shape[1]
-    action = _mean_norm(found[0])
-    derivative = probes.gain / count**0.5 * _mean_norm(found[1].flatten(1))
+    action = _mean_norm(found[0], units)
+    derivative = probes.gain / count**0.5 * _mean_norm(found[1], units)
     total, curvature = action + weights.derivative * derivative, torch.zeros_like(action)
     if weights.curvature is not None:
-        curvature = probes.gain**2 / count**0.5 * _mean_norm(found[2].flatten(1))
+        curvature = probes.gain**2 / count**0.5 * _mean_norm(found[2], units)
         total = total + weights.curvature * curvature
     return TaylorLoss(total, action, derivative, curvature)
 
@@ -182,5 +187,7 @@ def _second_derivative_along(
     return answers, slopes, curvatures
 
 
-def _mean_norm(errors: Tensor) -> Tensor:
-    return torch.linalg.vector_norm(errors, dim=-1).mean()
+def _mean_norm(errors: Tensor, units: Tensor | None) -> Tensor:
+    """Return the mean over (B, ..., m) errors of a state's norm, in units (m,)."""
+    errors = errors if units is None else errors / units
+    return torch.linalg.vector_norm(errors.flatten(1), dim=-1).mean()

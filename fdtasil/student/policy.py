@@ -10,6 +10,7 @@ from fdtasil.compute import ask_module
 from fdtasil.errors import SettingError, StorageError, first_line
 from fdtasil.files.onnx.graph import Graph
 from fdtasil.files.tensors import tensors_from_bytes, tensors_to_bytes
+from fdtasil.probes.scales import Scales
 from fdtasil.student.architectures import Architecture, architecture_of, describe
 
 __all__ = ["Student"]
@@ -30,6 +31,7 @@ class Student(nn.Module):
         low: (m,) action bounds; the output of a bounded action is a scaled tanh.
         high: (m,) upper bounds; where a bound is infinite the output is linear.
         random: Draws the initial weights.
+        actions: Scales of the expert's actions, in which linear outputs are; None for ones.
     """
 
     mean: Tensor
@@ -48,6 +50,7 @@ class Student(nn.Module):
         low: np.ndarray,
         high: np.ndarray,
         random: torch.Generator,
+        actions: Scales | None = None,
     ) -> None:
         super().__init__()
         self.architecture = architecture
@@ -55,13 +58,16 @@ class Student(nn.Module):
             self.register_buffer(name, torch.from_numpy(np.array(value, np.float32)))
         self.network = architecture.build(len(mean), len(low), random)
         bounded = np.isfinite(low) & np.isfinite(high)
-        # Constants of the graph, from the bounds; safetensors has no use for them.
-        centre = np.where(bounded, (np.where(bounded, high, 0) + np.where(bounded, low, 0)) / 2, 0)
-        half = np.where(bounded, (np.where(bounded, high, 2) - np.where(bounded, low, 0)) / 2, 1)
-        self._all_bounded = bool(bounded.all())
+        middle, reach = (0.0, 1.0) if actions is None else (actions.mean, actions.scale)
+        with np.errstate(invalid="ignore"):  # of infinite bounds, which are not chosen
+            centre = np.where(bounded, (high + low) / 2, middle)
+            half = np.where(bounded, (high - low) / 2, reach)
+        # Where all are bounded they follow from the bounds, and no file needs them.
+        stored = not bounded.all()
         self.register_buffer("_bounded", torch.from_numpy(bounded), persistent=False)
-        self.register_buffer("_centre", torch.from_numpy(centre).float(), persistent=False)
-        self.register_buffer("_half", torch.from_numpy(half).float(), persistent=False)
+        self.register_buffer("_centre", torch.from_numpy(centre).float(), persistent=stored)
+        self.register_buffer("_half", torch.from_numpy(half).float(), persistent=stored)
+        self._all_bounded = bool(bounded.all())
 
     @property
     def observation_size(self) -> int:
@@ -85,17 +91,22 @@ class Student(nn.Module):
         """Add the nodes of the student to an ONNX graph; see `Writable`."""
         centred = graph.node("Sub", value, graph.constant(self.mean))
         raw = graph.module(self.network, graph.node("Div", centred, graph.constant(self.scale)))
-        if not self._bounded.any():
-            return raw
-        squashed = graph.node("Tanh", raw)
-        actions = graph.node("Mul", squashed, graph.constant(self._half))
-        if self._centre.any():
-            actions = graph.node("Add", actions, graph.constant(self._centre))
-        if self._all_bounded:
-            return actions
-        share = graph.constant(self._bounded.float())  # of the bounded actions; the rest is raw
-        rest = graph.node("Mul", raw, graph.constant(1 - self._bounded.float()))
-        return graph.node("Add", graph.node("Mul", actions, share), rest)
+        actions = graph.node("Tanh", raw) if self._bounded.any() else raw
+        if self._bounded.any() and not self._all_bounded:
+            shares = self._bounded.float(), 1 - self._bounded.float()
+            parts = zip((actions, raw), shares, strict=True)
+            actions = graph.node(
+                "Add", *(graph.node("Mul", p, graph.constant(s)) for p, s in parts)
+            )
+        for operator, constant, idle in (("Mul", self._half, 1), ("Add", self._centre, 0)):
+            if (constant != idle).any():
+                actions = graph.node(operator, actions, graph.constant(constant))
+        return actions
+
+    @property
+    def action_units(self) -> Tensor:
+        """(m,) half the range of a bounded action, the deviation of the expert's elsewhere."""
+        return self._half
 
     def act(self, observations: np.ndarray) -> np.ndarray:
         """Answer as a policy: (B, n) float32 -> (B, m) float32."""
@@ -149,8 +160,11 @@ class Student(nn.Module):
         tensors, about = tensors_from_bytes(data, _ENTRY, "a student's weights")
         try:
             fields = {k: v for k, v in about["student"].items() if not k.endswith("_size")}
-            bounds = {name: tensors[name].numpy() for name in ("mean", "scale", "low", "high")}
-            student = cls(architecture_of(fields), **bounds, random=torch.Generator())
+            mean, scale, low, high = (
+                tensors[name].numpy() for name in ("mean", "scale", "low", "high")
+            )
+            architecture, random = architecture_of(fields), torch.Generator()
+            student = cls(architecture, mean, scale, low, high, random)
             student.load_state_dict(tensors)
         except (KeyError, TypeError, ValueError, RuntimeError) as error:
             raise StorageError(

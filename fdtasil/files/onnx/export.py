@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import torch
 
+from fdtasil.compute import in_turn, usual_modes
 from fdtasil.errors import ExportError, first_line
 from fdtasil.files.onnx.graph import OPSET, can_write, write_model
 from fdtasil.files.onnx.session import open_session, run_session
@@ -48,7 +49,7 @@ def export_module(
     training = module.training
     module.eval()
     try:
-        with torch.no_grad():
+        with usual_modes(), torch.no_grad():
             expected = module(example).numpy()
         model = (
             write_model(module, example.shape[1], expected.shape[1])
@@ -84,7 +85,7 @@ def _traced(module: torch.nn.Module, example: torch.Tensor) -> "onnx.ModelProto"
             'pip install "fdtasil[export]"',
         )
     try:
-        with _silenced():
+        with in_turn(), usual_modes(), _silenced():
             program = torch.onnx.export(
                 module,
                 (example[:2],),
