@@ -14,6 +14,7 @@ from fdtasil.rollouts.behaviours import follow, random_behaviour
 from fdtasil.rollouts.environments import EnvironmentPool, resolve_horizon
 from fdtasil.rollouts.episodes import Episodes, check_episodes
 from fdtasil.rollouts.rollout import first_observations, rollout
+from fdtasil.rollouts.trials import check_repeats
 from fdtasil.seeding import episode_seeds, generator
 
 __all__ = ["LOOKED_AT", "Looked", "check_first", "examine", "look_closely"]
@@ -70,15 +71,11 @@ def check_first(
     """Check an expert on first states, before it acts; the arguments of `examine`.
 
     Raises:
+        EnvironmentFault: If the environment remembers earlier episodes.
         ExpertError: If it fails a check.
     """
+    check_repeats(pool, starts[0], force=force)
     first = first_observations(pool, [starts[e % len(starts)] for e in range(GATE_STATES)])
-    if not np.array_equal(first_observations(pool, starts[:1])[0], first[0]):
-        warn(
-            f"{pool.name} does not start from the same observation twice with one seed, so equal "
-            "runs differ, and expert and student are not compared from the same starts: seed it "
-            "in reset(), and take off wrappers with a memory (NormalizeObservation)"
-        )
     _announce(admit_expert(expert, first, pool.boxes, force=force), rows)
 
 

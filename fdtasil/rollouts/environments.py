@@ -5,11 +5,13 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from types import TracebackType
+from typing import Any
 
 import gymnasium
 import numpy as np
 
 from fdtasil.checks import check_count
+from fdtasil.compute import in_turn
 from fdtasil.errors import EnvironmentFault, SettingError, first_line, warn
 
 __all__ = ["EnvironmentLike", "EnvironmentPool", "resolve_horizon", "simulator_warnings"]
@@ -24,6 +26,7 @@ class Boxes:
     Attributes:
         observation_size: n, the length of an observation.
         low: (m,) float32, lower action bounds in environment units; -inf where there is none.
+            Bounds that float32 does not have are rounded inwards.
         high: (m,) float32, upper action bounds.
     """
 
@@ -37,6 +40,35 @@ class Boxes:
         return len(self.low)
 
 
+@dataclass(frozen=True)
+class OwnBounds:
+    """The action bounds as the environment has them: its own dtype, not rounded.
+
+    Attributes:
+        low: (m,) lower bounds.
+        high: (m,) upper bounds.
+    """
+
+    low: np.ndarray
+    high: np.ndarray
+
+    def put_inside(self, actions: np.ndarray) -> tuple[np.ndarray, int]:
+        """Return actions as the environment takes them, and how many rows had to be clipped.
+
+        Args:
+            actions: (B, m) float32.
+        """
+        # float32 has no 0.1: an action at such a bound is beyond it by a rounding, and is not
+        # counted.
+        low, high = (np.asarray(bound, np.float32) for bound in (self.low, self.high))
+        clipped = np.minimum(np.maximum(actions, low), high)
+        count = int((clipped != actions).any(axis=1).sum())
+        own = clipped.astype(self.low.dtype, copy=False)
+        if own.dtype == np.float32:
+            return own, count
+        return np.minimum(np.maximum(own, self.low), self.high), count
+
+
 class EnvironmentPool:
     """Equal copies of one environment, made when they are needed and kept for the next rollout.
 
@@ -44,6 +76,14 @@ class EnvironmentPool:
         environment: A gymnasium id (`module:Id` imports the module first), a gymnasium
             environment, or a function without arguments that makes one. An environment that is
             passed in is used as it is, one episode at a time, and is not closed.
+
+    Attributes:
+        name: What messages call it.
+        time_limit: Steps after which it ends an episode itself, or None.
+        boxes: Its spaces.
+        bounds: Of its actions, in its own dtype.
+        independent: Whether its copies are known not to disturb each other.
+        trials: What it did when it was tried, by seed; see `trials.py`.
 
     Raises:
         EnvironmentFault: If it can't be made, or its spaces are not flat continuous boxes.
@@ -56,6 +96,7 @@ class EnvironmentPool:
 
     def __init__(self, environment: EnvironmentLike) -> None:
         self._owned = not isinstance(environment, gymnasium.Env)
+        self._single = False
         self._advice = (
             "try gymnasium.make(...) on its own; ids of other packages are 'module:Id'"
             if isinstance(environment, str)
@@ -64,15 +105,18 @@ class EnvironmentPool:
         self._make = _factory(environment)
         first = self._new()
         self._members = [first]
+        self._kept: list[gymnasium.Env] = []  # only to be closed
+        self.independent = False
+        self.trials: dict[int, Any] = {}
         self.name = first.spec.id if first.spec else type(first.unwrapped).__name__
         self.time_limit = _time_limit(first)
-        self.boxes = _read_boxes(first, self.name)
+        self.boxes, self.bounds = _read_boxes(first, self.name)
 
     def take(self, count: int) -> list[gymnasium.Env]:
         """Return up to `count` copies; fewer where only one exists."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the first copy has said it all
-            while self._owned and len(self._members) < count:
+            while self._owned and not self._single and len(self._members) < count:
                 made = self._new()
                 if any(made is member for member in self._members):
                     self._owned = False  # a factory that hands out one and the same
@@ -80,9 +124,15 @@ class EnvironmentPool:
                 self._members.append(made)
         return self._members[:count]
 
+    def keep_to_one(self) -> None:
+        """Hand out the first copy alone from now on."""
+        self._kept += self._members[1:]
+        del self._members[1:]
+        self._single = True
+
     def close(self) -> None:
         """Close the copies that the pool made."""
-        for member in self._members if self._owned else []:
+        for member in [*self._members, *self._kept] if self._owned else []:
             member.close()
 
     def __enter__(self) -> "EnvironmentPool":
@@ -148,12 +198,14 @@ def simulator_warnings() -> Iterator[None]:
 
     # getattr: the type stubs do not know these two functions.
     get, put = (getattr(mujoco, f"{verb}_mju_user_warning") for verb in ("get", "set"))
-    before, messages = get(), dict[str, None]()
-    put(lambda message: messages.update({message: None}))
-    try:
-        yield
-    finally:
-        put(before)
+    messages = dict[str, None]()
+    with in_turn():  # the process has one such function
+        before = get()
+        put(lambda message: messages.update({message: None}))
+        try:
+            yield
+        finally:
+            put(before)
     for message in messages:
         if "deprecated" not in message and "simulation is unstable" not in message:
             warn(f"MuJoCo: {message}")
@@ -184,10 +236,11 @@ def _time_limit(environment: gymnasium.Env) -> int | None:
     return min((limit for limit in limits if limit), default=None)
 
 
-def _read_boxes(environment: gymnasium.Env, name: str) -> Boxes:
+def _read_boxes(environment: gymnasium.Env, name: str) -> tuple[Boxes, OwnBounds]:
     observation = _flat_box(environment.observation_space, name, "observations")
     action = _flat_box(environment.action_space, name, "actions")
-    low, high = (_bound(bound) for bound in (action.low, action.high))
+    own = OwnBounds(_unbounded(action.low), _unbounded(action.high))
+    low, high = _rounded(own.low, np.inf), _rounded(own.high, -np.inf)
     if not (low < high).all():
         first = int((~(low < high)).argmax())
         raise EnvironmentFault(
@@ -195,13 +248,20 @@ def _read_boxes(environment: gymnasium.Env, name: str) -> Boxes:
             "lower bounds below upper bounds",
             "drop the fixed actions with a gymnasium.ActionWrapper",
         )
-    return Boxes(int(observation.shape[0]), low, high)
+    return Boxes(int(observation.shape[0]), low, high), own
 
 
-def _bound(bound: np.ndarray) -> np.ndarray:
-    """Return bounds as float32; those as large as float32 itself are a way to say none."""
+def _unbounded(bound: np.ndarray) -> np.ndarray:
+    """Return bounds in their own dtype; those as large as float32 itself are a way to say none."""
     wide = bound.astype(np.float64)
-    return np.where(np.abs(wide) > 1e30, np.copysign(np.inf, wide), wide).astype(np.float32)
+    return np.where(np.abs(wide) > 1e30, np.copysign(np.inf, wide), wide).astype(bound.dtype)
+
+
+def _rounded(bound: np.ndarray, inwards: float) -> np.ndarray:
+    """Return bounds as float32, none of them beyond what was given."""
+    near = bound.astype(np.float32)
+    beyond = near < bound if inwards > 0 else near > bound
+    return np.where(beyond, np.nextafter(near, np.float32(inwards)), near)
 
 
 def _flat_box(space: gymnasium.Space, name: str, role: str) -> gymnasium.spaces.Box:

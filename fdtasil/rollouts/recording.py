@@ -1,6 +1,11 @@
 """Episodes while they are recorded: every answer of an environment is looked at here."""
 
-from collections.abc import Sequence
+import copy
+from collections.abc import Mapping, Sequence
+from contextlib import suppress
+from numbers import Real
+from types import NoneType
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -24,7 +29,7 @@ class Recording:
 
     def __init__(self, seeds: Sequence[int], horizon: int, pool: EnvironmentPool) -> None:
         n, m = pool.boxes.observation_size, pool.boxes.action_size
-        self._low, self._high, self._name = pool.boxes.low, pool.boxes.high, pool.name
+        self._bounds, self._name = pool.bounds, pool.name
         self._seeds, episodes = [int(seed) for seed in seeds], len(seeds)
         self.observations = np.zeros((episodes, horizon, n), np.float32)
         self.actions = np.zeros((episodes, horizon, m), np.float32)
@@ -41,9 +46,19 @@ class Recording:
     def reset(self, environment: gymnasium.Env, episode: int) -> np.ndarray:
         """Return the first observation of an episode."""
         try:
-            observation, _ = environment.reset(seed=self._seeds[episode])
+            answer = environment.reset(seed=self._seeds[episode])
         except Exception as error:
-            raise self._crash(episode, None, "reset()", error) from error
+            advice = _reset_advice(error)
+            raise self._crash(episode, None, "reset()", error, advice) from error
+        pair = isinstance(answer, tuple) and len(answer) == 2
+        if not pair or not isinstance(answer[1], Mapping | NoneType):
+            raise EnvironmentFault(
+                f"{self._where(episode, None)}: reset() returned {_described_reset(answer)}",
+                "(observation, info)",
+                "end reset() with: return observation, {}  (an environment of the old gym "
+                "package: wrap it so)",
+            )
+        observation = _own(answer[0])
         self._data[episode] = getattr(environment.unwrapped, "data", None)
         return observation
 
@@ -59,10 +74,10 @@ class Recording:
             raise self._crash(episode, step, "step()", error) from error
         try:
             observation, reward, terminated, truncated, _ = answer
-            self.rewards[episode, step] = float(reward)
-            self.terminated[episode] = bool(terminated)
-            going = not (terminated or truncated)
-        except (TypeError, ValueError) as error:
+            self.rewards[episode, step] = _number(reward)
+            self.terminated[episode] = fallen = bool(_number(terminated))
+            going = not (fallen or bool(_number(truncated)))
+        except (TypeError, ValueError, OverflowError) as error:
             raise self._fault(
                 episode,
                 step,
@@ -74,7 +89,7 @@ class Recording:
         now = _clock(data)
         if now < before or ((now == before or step == 0) and _unstable(data)):
             self.physics_resets[episode] += 1
-        return observation, going
+        return _own(observation), going
 
     def check_rewards(self, alive: Sequence[int], step: int) -> None:
         """Raise where a reward is not finite: it would make every mean so."""
@@ -95,7 +110,9 @@ class Recording:
         """
         size = self.observations.shape[2]
         try:
-            batch = np.array(observations)
+            # numpy would drop the masks of masked arrays.
+            whole = not any(map(np.ma.is_masked, observations))
+            batch = np.array(observations) if whole else np.empty(0)
         except ValueError:  # of several lengths
             batch = np.empty(0)
         if batch.shape == (len(alive), size) and batch.dtype.kind in "fiu":
@@ -111,7 +128,7 @@ class Recording:
     def decide(
         self, alive: list[int], step: int, observations: np.ndarray, decision: Decision
     ) -> np.ndarray:
-        """Record a step's decision; return its actions within the bounds."""
+        """Record a step's decision; return its actions as the environment takes them."""
         expected = (len(alive), self.actions.shape[2])
         if decision.action.shape == expected and not np.isfinite(decision.action).all():
             row = int((~np.isfinite(decision.action).all(axis=1)).argmax())
@@ -132,8 +149,8 @@ class Recording:
         if decision.expert_action is not None:
             self.expert_actions[alive, step] = decision.expert_action
             self.answered[alive, step] = True
-        allowed = np.minimum(np.maximum(decision.action, self._low), self._high)
-        self.clipped_actions += int((allowed != decision.action).any(axis=1).sum())
+        allowed, clipped = self._bounds.put_inside(decision.action)
+        self.clipped_actions += clipped
         return allowed
 
     def episodes(self) -> Episodes:
@@ -171,13 +188,18 @@ class Recording:
         )
 
     def _crash(
-        self, episode: int, step: int | None, call: str, error: Exception
+        self,
+        episode: int,
+        step: int | None,
+        call: str,
+        error: Exception,
+        advice: str | None = None,
     ) -> EnvironmentFault:
         said = f"{call} raised {type(error).__name__}: {first_line(error)}"
         return EnvironmentFault(
             f"{self._where(episode, step)}: {said}",
             "an environment that runs without raising",
-            "run it on its own from that seed, and mend it",
+            advice or "run it on its own from that seed, and mend it",
         )
 
 
@@ -203,11 +225,75 @@ def _described(answer: object) -> str:
         return f"a {type(answer).__name__}"
     if len(answer) != 5:
         return f"{len(answer)} things"
-    return f"reward={answer[1]!r}, terminated={answer[2]!r}, truncated={answer[3]!r}"[:200]
+    parts = zip(("reward", "terminated", "truncated"), answer[1:4], strict=True)
+    return ", ".join(f"{name}={_printed(value)}" for name, value in parts)[:200]
+
+
+def _printed(value: object) -> str:
+    try:
+        return repr(value)
+    except Exception as error:  # int has a longest text, and a class of the user's may raise
+        return f"a {type(value).__name__} ({first_line(error)})"
+
+
+def _reset_advice(error: Exception) -> str | None:
+    """Return what to do about a reset() that raises for a reason that is often met, or None."""
+    said = first_line(error)
+    if isinstance(error, TypeError) and "unexpected keyword argument" in said:
+        return "write def reset(self, *, seed=None, options=None): gymnasium passes both by name"
+    frame = error.__traceback__
+    while frame is not None and frame.tb_next is not None:
+        frame = frame.tb_next
+    inside = frame.tb_frame.f_locals if frame is not None else {}
+    looked_into = "'NoneType' object" in said or isinstance(error, AssertionError | KeyError)
+    if "options" in said or (looked_into and inside.get("options", "") is None):
+        return (
+            "give it its options in a wrapper: class WithOptions(gymnasium.Wrapper): "
+            "def reset(self, *, seed=None, options=None): "
+            "return self.env.reset(seed=seed, options={...})"
+        )
+    return None
+
+
+def _described_reset(answer: object) -> str:
+    """Return in words what reset() returned."""
+    if isinstance(answer, tuple) and len(answer) == 2:
+        return f"a {type(answer[1]).__name__} in place of info"
+    if isinstance(answer, tuple):
+        return f"{len(answer)} things"
+    shape = f" of shape {np.shape(answer)}" if isinstance(answer, np.ndarray) else ""
+    return f"a {type(answer).__name__}{shape}"
+
+
+def _own(observation: Any) -> Any:
+    """Return an observation that stays as it is when the environment writes into its buffer."""
+    if isinstance(observation, np.ndarray):
+        return observation.copy()
+    with suppress(Exception):  # what can't be copied is no vector, and is named so in a moment
+        return copy.deepcopy(observation)
+    return observation
+
+
+def _number(value: object) -> float:
+    """Return a reward or an end as a number; numpy's and torch's of one element are as good.
+
+    Raises:
+        TypeError, ValueError: If it is none: float("1") and bool("False") would pass for one.
+        OverflowError: If it is too large for a float.
+    """
+    if not isinstance(value, Real):
+        if np.ma.is_masked(value) or np.asarray(value).dtype.kind not in "biuf":
+            raise TypeError
+        if np.size(value) != 1:  # pyright: ignore[reportArgumentType]
+            raise ValueError
+        return float(np.asarray(value).reshape(()))
+    return float(value)
 
 
 def _problem(observation: object, size: int) -> str | None:
     """Return what is wrong with an observation, or None."""
+    if np.ma.is_masked(observation):
+        return "some of the observation's values are masked"
     values = np.asarray(observation)
     if values.dtype.kind not in "fiu":
         return f"the observation is a {type(observation).__name__} of {values.dtype}"

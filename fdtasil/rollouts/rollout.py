@@ -8,6 +8,8 @@ from fdtasil.rollouts.behaviours import Behaviour
 from fdtasil.rollouts.environments import EnvironmentPool, simulator_warnings
 from fdtasil.rollouts.episodes import Episodes
 from fdtasil.rollouts.recording import Recording
+from fdtasil.rollouts.stepping import step_together
+from fdtasil.rollouts.trials import independent_copies
 
 __all__ = ["first_observations", "rollout"]
 
@@ -44,29 +46,12 @@ def rollout(
     """
     record = Recording(seeds, horizon, pool)
     generators = list(noise) if noise is not None else [np.random.default_rng(s) for s in seeds]
-    members = pool.take(min(len(seeds), _SLOTS))
     with simulator_warnings():
+        members = independent_copies(pool, min(len(seeds), _SLOTS))
         for first in range(0, len(seeds), len(members)):
             chunk = range(first, min(first + len(members), len(seeds)))
             environments = dict(zip(chunk, members, strict=False))
-            alive = list(chunk)
-            first_ones = [record.reset(environments[e], e) for e in alive]
-            batch = record.observed(first_ones, alive, None)
-            for step in range(horizon):
-                decision = behaviour(batch, [generators[e] for e in alive])
-                allowed = record.decide(alive, step, batch, decision)
-                after, going = [], np.ones(len(alive), bool)
-                for row, episode in enumerate(alive):
-                    observation, going[row] = record.step(
-                        environments[episode], allowed[row], episode, step
-                    )
-                    after.append(observation)
-                on_step(len(alive))
-                record.check_rewards(alive, step)
-                batch = record.observed(after, alive, step)[going]
-                alive = [episode for row, episode in enumerate(alive) if going[row]]
-                if not alive:
-                    break
+            step_together(record, environments, behaviour, generators, horizon, on_step)
     return record.episodes()
 
 

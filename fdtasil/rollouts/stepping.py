@@ -1,0 +1,48 @@
+"""Episodes side by side, step by step: one batch of decisions for all that still go on."""
+
+from collections.abc import Callable, Mapping, Sequence
+
+import gymnasium
+import numpy as np
+
+from fdtasil.rollouts.behaviours import Behaviour
+from fdtasil.rollouts.recording import Recording
+
+__all__ = ["step_together"]
+
+
+def step_together(
+    record: Recording,
+    environments: Mapping[int, gymnasium.Env],
+    behaviour: Behaviour,
+    noise: Sequence[np.random.Generator],
+    horizon: int,
+    on_step: Callable[[int], None] = lambda count: None,
+) -> None:
+    """Play episodes until each is over.
+
+    Args:
+        record: Where they are recorded.
+        environments: Number of an episode -> the environment that it is played in.
+        behaviour: Who acts.
+        noise: Generators handed to it, by the number of the episode.
+        horizon: T, steps after which an episode is cut.
+        on_step: Told the number of environment steps just done.
+    """
+    alive = list(environments)
+    batch = record.observed([record.reset(environments[e], e) for e in alive], alive, None)
+    for step in range(horizon):
+        decision = behaviour(batch, [noise[e] for e in alive])
+        allowed = record.decide(alive, step, batch, decision)
+        after, going = [], np.ones(len(alive), bool)
+        for row, episode in enumerate(alive):
+            observation, going[row] = record.step(
+                environments[episode], allowed[row], episode, step
+            )
+            after.append(observation)
+        on_step(len(alive))
+        record.check_rewards(alive, step)
+        batch = record.observed(after, alive, step)[going]
+        alive = [episode for row, episode in enumerate(alive) if going[row]]
+        if not alive:
+            break

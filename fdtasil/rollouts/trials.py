@@ -1,0 +1,196 @@
+"""A few steps with drawn actions: whether an environment does twice what it did once."""
+
+from collections.abc import Iterator, Sequence
+from contextlib import suppress
+from dataclasses import dataclass
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from fdtasil.errors import EnvironmentFault, FdtasilError, warn
+from fdtasil.rollouts.behaviours import random_behaviour
+from fdtasil.rollouts.environments import EnvironmentPool, simulator_warnings
+from fdtasil.rollouts.recording import Recording
+from fdtasil.rollouts.stepping import step_together
+
+__all__ = ["Trial", "check_repeats", "fingerprint", "independent_copies"]
+
+_STEPS = 3  # a wrapper that remembers shows it at the first, a simulator that is shared as well
+# Of two numbers that are the same but for the rounding of a simulator: relative to the value, and
+# to the largest one beside it (a coordinate may be all rounding).
+_SAME, _BESIDE = 1e-4, 1e-6
+
+
+@dataclass(frozen=True)
+class Trial:
+    """The first steps of an episode.
+
+    Attributes:
+        observations: (T, n) float32, before each step.
+        rewards: (T, 1) float64.
+    """
+
+    observations: np.ndarray
+    rewards: np.ndarray
+
+    def equals(self, other: "Trial") -> bool:
+        """Whether two trials are equal to the bit."""
+        ours, theirs = vars(self).values(), vars(other).values()
+        return all(np.array_equal(a, b) for a, b in zip(ours, theirs, strict=True))
+
+    def other_than(self, other: "Trial") -> str | None:
+        """Return what differs by more than rounding, or None."""
+        if len(self.rewards) != len(other.rewards):
+            return "length of the episode"
+        if differ(self.observations[0], other.observations[0]):
+            return "first observation"
+        if differ(self.rewards, other.rewards):
+            return "reward"
+        return "observation" if differ(self.observations, other.observations) else None
+
+
+def differ(ours: np.ndarray, theirs: np.ndarray) -> bool:
+    """Whether two arrays of one shape differ by more than a simulator's rounding.
+
+    Example:
+        >>> first, again = np.array([1e-7, 3.0]), np.array([1.1e-7, 3.0])
+        >>> differ(first, again), differ(first, 2 * again)
+        (False, True)
+    """
+    sizes = np.maximum(np.abs(ours), np.abs(theirs)).astype(np.float64)
+    bound = _SAME * sizes.reshape(-1, sizes.shape[-1]).max(axis=0) + _BESIDE * sizes.max()
+    return bool((np.abs(ours.astype(np.float64) - theirs) > bound).any())
+
+
+def check_repeats(pool: EnvironmentPool, seed: int, *, force: bool = False) -> None:
+    """Look whether equal seeds and actions give equal episodes.
+
+    Args:
+        pool: The environment.
+        seed: Of the reset.
+        force: Only warn of what remembers.
+
+    Raises:
+        EnvironmentFault: If it, or a wrapper of it, remembers earlier episodes: an expert would
+            not even be as good as itself.
+    """
+    first, again = _tried(pool, seed)
+    what = first.other_than(again)
+    if what is None:
+        if not first.equals(again):
+            warn(
+                f"{pool.name} repeats an episode of one seed only up to rounding, so equal runs "
+                "differ in their last digits"
+            )
+        return
+    layer = _culprit(pool, seed)
+    if not _remembers(pool, layer, first, seed):
+        warn(
+            f"{pool.name} does not give the same {what} twice with one seed, so equal "
+            "runs differ, and expert and student are not compared from the same starts: seed it "
+            "in reset(), and take off wrappers with a memory (NormalizeObservation)"
+        )
+        return
+    kind = type(layer).__name__
+    found = f"{pool.name}: {kind} remembers earlier episodes: one seed, another {what}"
+    if force:
+        warn(f"{found} (forced)")
+        return
+    frozen = ", or set its update_running_mean = False" * hasattr(layer, "update_running_mean")
+    raise EnvironmentFault(
+        found,
+        "equal episodes for equal seeds and actions: returns could not be compared",
+        f"leave {kind} out of the environment{frozen}; force=True goes on as it is",
+    )
+
+
+def fingerprint(pool: EnvironmentPool, seed: int) -> dict[str, Any] | None:
+    """Return what tells an environment from another, as plain JSON values.
+
+    Args:
+        pool: The environment.
+        seed: Of the reset.
+
+    Returns:
+        `seed`, `observation` (the first one), and `after` and `reward` of one step; six digits
+        each. None where the environment does not repeat itself.
+    """
+    first, again = _tried(pool, seed)
+    if first.other_than(again) is not None:
+        return None
+    return {
+        "seed": seed,
+        "observation": _written(first.observations[0]),
+        "after": _written(first.observations[1:2].ravel()),
+        "reward": _written(first.rewards[0]),
+    }
+
+
+def independent_copies(pool: EnvironmentPool, count: int) -> list[gymnasium.Env]:
+    """Return up to `count` copies that don't disturb each other; one where they do."""
+    members = pool.take(count)
+    if len(members) == 1 or pool.independent:
+        return members
+    alone = _trial(pool, members[:1])
+    if alone.other_than(_trial(pool, members[:2])) and not alone.other_than(
+        _trial(pool, members[:1])  # who does not even repeat itself can't be judged so
+    ):
+        warn(
+            f"copies of {pool.name} share one simulator: stepping one moves the others, so "
+            "episodes are played one after another, in the first copy"
+        )
+        pool.keep_to_one()
+        return members[:1]
+    pool.independent = True
+    return members
+
+
+def _tried(pool: EnvironmentPool, seed: int) -> tuple[Trial, Trial]:
+    """Return two trials of one seed; the same two, whenever they are asked for."""
+    if seed not in pool.trials:
+        (member,) = pool.take(1)
+        pool.trials[seed] = _trial(pool, [member], seed), _trial(pool, [member], seed)
+    return pool.trials[seed]
+
+
+def _trial(pool: EnvironmentPool, environments: Sequence[gymnasium.Env], seed: int = 0) -> Trial:
+    """Play in the first environment, with the others beside it."""
+    seeds = range(seed, seed + len(environments))
+    record, noise = Recording(seeds, _STEPS, pool), [np.random.default_rng(s) for s in seeds]
+    with simulator_warnings():
+        numbered = dict(enumerate(environments))
+        step_together(record, numbered, random_behaviour(pool), noise, _STEPS)
+    valid = record.valid[0]
+    return Trial(record.observations[0, valid], record.rewards[0, valid, None])
+
+
+def _culprit(pool: EnvironmentPool, seed: int) -> gymnasium.Env:
+    """Return the innermost layer of an environment that does not repeat itself."""
+    (member,) = pool.take(1)
+    for layer in reversed(list(_layers(member))):
+        with suppress(FdtasilError):  # it may have other spaces than the whole
+            if _trial(pool, [layer], seed).other_than(_trial(pool, [layer], seed)):
+                return layer
+    return member
+
+
+def _remembers(pool: EnvironmentPool, layer: gymnasium.Env, first: Trial, seed: int) -> bool:
+    """Whether a layer that does not repeat itself has a memory, and is not merely unseeded."""
+    if getattr(layer, "update_running_mean", False):
+        return True
+    fresh = pool.take(2)[1:]  # who is unseeded is so from the start
+    return bool(fresh) and _trial(pool, fresh, seed).other_than(first) is None
+
+
+def _layers(environment: gymnasium.Env) -> Iterator[gymnasium.Env]:
+    yield environment
+    while isinstance(environment, gymnasium.Wrapper):
+        environment = environment.env
+        yield environment
+
+
+def _written(values: np.ndarray) -> list[float]:
+    """Return up to 64 numbers, evenly spread, with six digits: more than rounding leaves."""
+    chosen = values[np.linspace(0, len(values) - 1, min(len(values), 64)).astype(int)]
+    return [float(f"{value:.6g}") for value in chosen]
