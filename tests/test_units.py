@@ -1,0 +1,82 @@
+"""Observations and actions of any size: a student learns as well in any unit."""
+
+from dataclasses import replace
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from toy_environments import Integrator
+from toy_tasks import linear_task, stream
+
+import fdtasil
+from fdtasil.files.onnx.export import export_module
+from fdtasil.probes.scales import measure_scales
+from fdtasil.progress import Progress
+from fdtasil.results.evaluation import evaluate_pair
+from fdtasil.rollouts.behaviours import follow
+from fdtasil.rollouts.environments import EnvironmentPool
+from fdtasil.rollouts.rollout import rollout
+from fdtasil.student.architectures import Mlp
+from fdtasil.student.fit import Fit, fit
+from fdtasil.student.policy import Student
+
+
+def trained(unit, bounded):
+    """Return a student of an expert whose actions are `unit` times as large, and its states."""
+    states, _, _ = linear_task()
+    states = replace(states, actions=(unit * states.actions).astype(np.float32))
+    bound = np.full(2, 3.0 * unit if bounded else np.inf, np.float32)
+    scales, actions = measure_scales(states.observations), measure_scales(states.actions)
+    random = torch.Generator().manual_seed(0)
+    student = Student(Mlp(32), scales.mean, scales.scale, -bound, bound, random, actions)
+    history = fit(student, states, None, None, Fit(steps=300), stream)
+    return student, states, history
+
+
+@pytest.mark.fault(200)
+@pytest.mark.parametrize("bounded", [True, False])
+@pytest.mark.parametrize("unit", [1e-9, 1e-4, 1e6])
+def test_actions_are_learnt_as_well_in_any_unit(unit, bounded):
+    usual, states, before = trained(1.0, bounded)
+    student, scaled, history = trained(unit, bounded)
+    assert history[-1]["loss"] == pytest.approx(before[-1]["loss"], rel=0.05)
+    error = np.abs(student.act(states.observations) / unit - usual.act(states.observations)).max()
+    assert error < 0.05
+    again = Student.from_bytes(student.to_bytes())
+    assert np.array_equal(again.act(states.observations), student.act(states.observations))
+
+
+@pytest.mark.fault(200)
+@pytest.mark.parametrize("low", [[-1, -np.inf], [-np.inf, -np.inf], [-1e-9, -5.0]])
+def test_the_exported_file_has_the_units_too(low, tmp_path):
+    low, rows = np.asarray(low), np.random.default_rng(0).standard_normal((50, 3))
+    actions = measure_scales(np.random.default_rng(1).normal(5.0, [2.0, 300.0], (50, 2)))
+    zeros, ones, random = np.zeros(3), np.ones(3), torch.Generator().manual_seed(0)
+    student = Student(Mlp(8), zeros, ones, low, -low, random, actions)
+    rows = rows.astype(np.float32)
+    (tmp_path / "s.onnx").write_bytes(export_module(student, rows, {}))
+    answers = fdtasil.load_expert(tmp_path / "s.onnx", 3, 2).ask(rows, "act")
+    assert np.allclose(answers, student.act(rows), rtol=1e-5, atol=1e-5 * np.abs(answers).max(0))
+
+
+def gap(unit):
+    """Return the imitation gap of two linear policies where observations are in a unit."""
+    box = gymnasium.spaces.Box(-np.inf, np.inf, Integrator().observation_space.shape)
+    scaled = gymnasium.wrappers.TransformObservation(Integrator(), lambda o: unit * o, box)
+
+    def policy(gain):
+        return lambda rows: (gain * rows[:, :2] / unit).astype(np.float32)
+
+    expert = fdtasil.load_expert(policy(-0.5))
+    with EnvironmentPool(scaled) as pool:
+        own = rollout(follow(expert.policy("evaluate")), pool, [1, 2], 15)
+        judged = evaluate_pair(policy(-0.3), expert, own, pool, 15, 0, Progress(False))
+    return judged.imitation_gap
+
+
+@pytest.mark.fault(201)
+@pytest.mark.parametrize("unit", [1e-7, 1e5])
+def test_the_imitation_gap_is_the_same_in_any_unit(unit):
+    assert gap(unit) == pytest.approx(gap(1.0), rel=1e-3)
+    assert gap(unit) > 0.1
