@@ -141,6 +141,15 @@ FAULTS = {
         122: "a clock that jumps",
         123: "no network",
     },
+    "one process, any unit": {
+        195: "runs in several threads of one process",
+        196: "a warning of one run while another goes on",
+        197: "a run inside the callback of a run",
+        198: "a caller in a mode of torch: no gradients, inference, float64, another device",
+        199: "an expert that is opened while a run goes on",
+        200: "actions in tiny or large units, bounded or not",
+        201: "observations in tiny or large units",
+    },
 }
 
 LEFT_OUT: dict[int, str] = {}
