@@ -9,7 +9,12 @@ from fdtasil.probes.directions import OrthogonalFrames, RandomSphere
 from fdtasil.probes.source import DIRECTIONS, Probes
 from fdtasil.probes.stencils import CENTRAL, FORWARD
 
-WITHOUT_COUNT = ("basis", "jacobian")
+
+
+def design_of(name, count):
+    """A design with so many directions, where it takes a number."""
+    spec = name if name in ("basis", "jacobian") else f"{name}:{count}"
+    return Probes.parse(spec).directions
 
 
 def states(dimension, physical=None):
@@ -41,7 +46,7 @@ def test_few_states_say_nothing_of_redundant_directions():
 @pytest.mark.parametrize("rows", [1, 40])
 @pytest.mark.parametrize("design", DIRECTIONS)
 def test_every_design_keeps_the_contract(design, rows, dimension):
-    directions = DIRECTIONS[design].parse(None if design in WITHOUT_COUNT else "7")
+    directions = design_of(design, 7)
     bank, numbers = directions.draw(rows, states(dimension), np.random.default_rng(0))
     assert bank.shape[1] == dimension
     assert numbers.shape == (rows, directions.count(dimension))
@@ -57,7 +62,7 @@ def test_every_design_keeps_the_contract(design, rows, dimension):
 def test_the_mean_square_of_a_derivative_is_the_jacobians(design):
     """E over directions of d |J u|^2 is |J|_F^2: what makes one weight fit every design."""
     jacobian = np.random.default_rng(1).standard_normal((3, 6))
-    directions = DIRECTIONS[design].parse(None if design in WITHOUT_COUNT else "12")
+    directions = design_of(design, 12)
     bank, numbers = directions.draw(600, states(6), np.random.default_rng(0))
     squares = 6 * ((bank[numbers] @ jacobian.T) ** 2).sum(axis=-1)
     assert squares.mean() == pytest.approx((jacobian**2).sum(), rel=0.05)

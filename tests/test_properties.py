@@ -126,7 +126,7 @@ def test_the_size_of_a_chunk_changes_no_byte(kind, rows, chunk, seed, asked_in_c
 def test_probes_are_never_fewer_than_asked_for(design, rows, dimension, count, moving, seed):
     """Also more of them than coordinates, and where observations are functions of few things."""
     fixed = design in ("basis", "jacobian")
-    directions = DIRECTIONS[design].parse(None if fixed else str(count))
+    directions = Probes.parse(design if fixed else f"{design}:{count}").directions
     moving = min(moving, dimension)
     states = random_array(seed, (60, moving)) @ random_array(seed + 1, (moving, dimension))
     bank, numbers = directions.draw(rows, states, np.random.default_rng(seed))

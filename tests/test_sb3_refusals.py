@@ -197,7 +197,7 @@ def test_wrong_environment(save, tmp_path):
 def test_truncated(part, plain):
     content = plain.read_bytes()
     plain.write_bytes(content[: int(part * len(content))])
-    with pytest.raises(ExpertError, match=r"no whole zip|copied whole"):
+    with pytest.raises(ExpertError, match=r"no whole zip|copied whole|has 0 bytes"):
         read_agent(plain)
 
 

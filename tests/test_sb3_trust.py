@@ -94,7 +94,7 @@ def test_no_code_of_statistics_runs(plain, tmp_path):
 
 def test_the_library_is_not_imported(plain):
     code = (
-        "import sys, fdtasil, fdtasil.sb3; fdtasil.sb3.read_agent(sys.argv[1]);"
+        "import sys; from fdtasil.experts.sb3.agent import read_agent; read_agent(sys.argv[1]);"
         "assert 'stable_baselines3' not in sys.modules"
     )
     subprocess.run([sys.executable, "-c", code, str(plain)], check=True)
