@@ -17,12 +17,14 @@ The rooms, on the way of the data; a room imports only those above it and the gr
     run             the loop
     shell           the commands
 
-On the ground: files, checks, seeding, compute, progress, errors. `fdtasil.testing` has checks for
+On the ground: files, checks, seeding, compute, progress, errors, version. `fdtasil.testing` has checks for
 experts and students of one's own.
 """
 
 from importlib import import_module
 from typing import TYPE_CHECKING
+
+from fdtasil.version import __version__
 
 if TYPE_CHECKING:
     from fdtasil.demonstrations.dataset import Dataset
@@ -39,8 +41,6 @@ if TYPE_CHECKING:
     from fdtasil.student.architectures import Mlp
     from fdtasil.student.fit import Fit
     from fdtasil.student.policy import Student
-
-__version__ = "0.1.0"
 
 __all__ = [
     "DAgger",

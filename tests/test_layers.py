@@ -22,7 +22,7 @@ FLOORS = [
     {"rollouts", "files"},
     {"seeding", "compute"},
     {"checks"},
-    {"errors", "progress"},
+    {"errors", "progress", "version"},
 ]
 FLOOR = {room: floor for floor, rooms in enumerate(FLOORS) for room in rooms}
 HOUSE = Path(fdtasil.__file__).parent

@@ -5,11 +5,11 @@ from dataclasses import replace
 from importlib.metadata import version
 from typing import Any
 
-import fdtasil
 from fdtasil.results.evaluation import Evaluation
 from fdtasil.run.checkpoints import Checkpoints
 from fdtasil.run.configuration import Configuration
 from fdtasil.run.lesson import Lesson
+from fdtasil.version import __version__
 
 __all__ = ["config_of", "report_of", "versions"]
 
@@ -18,7 +18,7 @@ _VERSIONED = ("torch", "numpy", "gymnasium", "mujoco", "onnx", "onnxruntime")
 
 def versions() -> dict[str, str]:
     """Return the versions that a run's bytes depend on."""
-    ours = {"python": platform.python_version(), "fdtasil": fdtasil.__version__}
+    ours = {"python": platform.python_version(), "fdtasil": __version__}
     return ours | {name: version(name) for name in _VERSIONED}
 
 

@@ -7,8 +7,8 @@ from collections.abc import Callable
 from importlib import import_module
 from typing import Any
 
-import fdtasil
 from fdtasil.errors import FdtasilError, FdtasilWarning, SettingError
+from fdtasil.version import __version__
 
 __all__ = ["COMMANDS", "main"]
 
@@ -25,7 +25,7 @@ def main() -> None:
     """Run the command line; exit code 0 done, 1 failed, 2 wrong use, 128 + N signal N."""
     name, *rest = sys.argv[1:] or [""]
     if name == "--version":
-        print(f"fdtasil {fdtasil.__version__}")
+        print(f"fdtasil {__version__}")
     elif name in ("-h", "--help"):
         print(_usage())
     elif name in COMMANDS:

@@ -7,7 +7,6 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
-import fdtasil
 from fdtasil.compute import ask_module
 from fdtasil.errors import ExpertError, SettingError
 from fdtasil.experts.sb3.agent import Agent, read_agent
@@ -18,6 +17,7 @@ from fdtasil.files.storage import write_bytes
 from fdtasil.rollouts.behaviours import follow
 from fdtasil.rollouts.environments import EnvironmentLike, EnvironmentPool
 from fdtasil.rollouts.rollout import rollout
+from fdtasil.version import __version__
 
 __all__ = ["export_sb3"]
 
@@ -132,7 +132,7 @@ def _metadata(agent: Agent) -> dict[str, str]:
         "observation_size": str(agent.observation_size),
         "action_low": _numbers(agent.action_low),
         "action_high": _numbers(agent.action_high),
-        "fdtasil": fdtasil.__version__,
+        "fdtasil": __version__,
         "torch": torch.__version__,
     }
     if agent.statistics_sha256 is not None:
