@@ -17,8 +17,8 @@ The rooms, on the way of the data; a room imports only those above it and the gr
     run             the loop
     shell           the commands
 
-On the ground: files, checks, seeding, compute, progress, errors, version. `fdtasil.testing` has checks for
-experts and students of one's own.
+On the ground: files, checks, seeding, compute, progress, errors, version. `fdtasil.testing` has
+checks for experts and students of one's own.
 """
 
 from importlib import import_module
