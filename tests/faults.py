@@ -149,6 +149,7 @@ FAULTS = {
         199: "an expert that is opened while a run goes on",
         200: "actions in tiny or large units, bounded or not",
         201: "observations in tiny or large units",
+        202: "observations in float64 whose movement float32 rounds away",
     },
 }
 

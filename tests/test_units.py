@@ -10,6 +10,7 @@ from toy_environments import Integrator
 from toy_tasks import linear_task, stream
 
 import fdtasil
+from fdtasil.errors import EnvironmentFault, FdtasilWarning
 from fdtasil.files.onnx.export import export_module
 from fdtasil.probes.scales import measure_scales
 from fdtasil.progress import Progress
@@ -80,3 +81,30 @@ def gap(unit):
 def test_the_imitation_gap_is_the_same_in_any_unit(unit):
     assert gap(unit) == pytest.approx(gap(1.0), rel=1e-3)
     assert gap(unit) > 0.1
+
+
+@pytest.mark.fault(202)
+@pytest.mark.parametrize("offset", [1e8, -1e9])
+def test_observations_far_from_zero_are_refused_in_float32(offset):
+    def shifted():
+        box = gymnasium.spaces.Box(-np.inf, np.inf, (3,), np.float64)
+        plain = gymnasium.make("Pendulum-v1")
+        return gymnasium.wrappers.TransformObservation(
+            plain, lambda o: o.astype(np.float64) + offset, box
+        )
+
+    def swing(rows):
+        return np.clip(-rows[:, 2:] + offset, -2, 2)
+
+    with pytest.raises(EnvironmentFault, match="float32 rounds away how 3 of the 3"):
+        fdtasil.distill(swing, shifted, 0, episodes=1, horizon=30, evaluation_episodes=2)
+
+
+@pytest.mark.fault(202)
+def test_a_single_coordinate_far_from_zero_is_warned_of():
+    box = gymnasium.spaces.Box(-np.inf, np.inf, (3,), np.float64)
+    clock = gymnasium.wrappers.TransformObservation(
+        gymnasium.make("Pendulum-v1"), lambda o: o.astype(np.float64) + [0, 0, 1e9], box
+    )
+    with EnvironmentPool(clock) as pool, pytest.warns(FdtasilWarning, match="how 1 of the 3"):
+        rollout(follow(lambda rows: 0 * rows[:, :1]), pool, [1, 2], 30)

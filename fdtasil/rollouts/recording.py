@@ -14,6 +14,7 @@ from fdtasil.errors import EnvironmentFault, first_line, warn
 from fdtasil.rollouts.behaviours import Decision
 from fdtasil.rollouts.environments import EnvironmentPool
 from fdtasil.rollouts.episodes import Episodes
+from fdtasil.rollouts.narrowing import Narrowing
 
 __all__ = ["Recording"]
 
@@ -40,6 +41,7 @@ class Recording:
         self.terminated = np.zeros(episodes, bool)
         self.physics_resets = np.zeros(episodes, np.int64)
         self.clipped_actions = 0
+        self._narrowing = Narrowing(n, pool.name)
         # Of MuJoCo's simulations, None elsewhere; asking an environment for it takes a while.
         self._data: list[object] = [None] * episodes
 
@@ -116,9 +118,11 @@ class Recording:
         except ValueError:  # of several lengths
             batch = np.empty(0)
         if batch.shape == (len(alive), size) and batch.dtype.kind in "fiu":
-            batch = batch.astype(np.float32, copy=False)
-            if np.isfinite(batch).all():
-                return batch
+            narrow = batch.astype(np.float32, copy=False)
+            if np.isfinite(narrow).all():
+                if narrow is not batch:
+                    self._narrowing.see(batch, narrow)
+                return narrow
         for episode, observation in zip(alive, observations, strict=True):
             problem = _problem(observation, size)
             if problem is not None:
@@ -154,7 +158,12 @@ class Recording:
         return allowed
 
     def episodes(self) -> Episodes:
-        """Return what was recorded; warn of physics that reset themselves."""
+        """Return what was recorded; warn of physics that reset themselves.
+
+        Raises:
+            EnvironmentFault: If float32 holds nothing of how the observations move.
+        """
+        self._narrowing.judge()
         unstable = np.count_nonzero(self.physics_resets)
         if unstable:
             warn(
