@@ -14,7 +14,14 @@ from fdtasil.rollouts.environments import EnvironmentPool, simulator_warnings
 from fdtasil.rollouts.recording import Recording
 from fdtasil.rollouts.stepping import step_together
 
-__all__ = ["Trial", "check_repeats", "fingerprint", "independent_copies"]
+__all__ = [
+    "Trial",
+    "check_repeats",
+    "differ",
+    "fingerprint",
+    "independent_copies",
+    "other_environment",
+]
 
 _STEPS = 3  # a wrapper that remembers shows it at the first, a simulator that is shared as well
 # Of two numbers that are the same but for the rounding of a simulator: relative to the value, and
@@ -125,6 +132,42 @@ def fingerprint(pool: EnvironmentPool, seed: int) -> dict[str, Any] | None:
         "after": _written(first.observations[1:2].ravel()),
         "reward": _written(first.rewards[0]),
     }
+
+
+_SHOWN = {
+    "observation": "its first observation",
+    "after": "its observation after one step",
+    "reward": "its first reward",
+}
+
+
+def other_environment(before: Any, now: Any) -> list[str]:
+    """Return in words what tells two environments apart, by their fingerprints.
+
+    Args:
+        before: What `fingerprint` returned once, as it is in a file; anything may be.
+        now: What it returns today.
+    """
+    if not isinstance(before, dict) or now is None or before.get("seed") != now["seed"]:
+        return []  # of a run of an earlier fdtasil, or nothing that could be compared
+    return [
+        f"{words} from seed {now['seed']} was {_some(before.get(name))}, is {_some(now[name])}"
+        for name, words in _SHOWN.items()
+        if _apart(before.get(name), now[name])
+    ]
+
+
+def _apart(before: Any, now: list[float]) -> bool:
+    try:
+        ours, theirs = np.asarray(before, np.float64), np.asarray(now, np.float64)
+        return ours.shape != theirs.shape or (ours.size > 0 and differ(ours, theirs))
+    except (TypeError, ValueError, OverflowError):  # a file that was changed
+        return True
+
+
+def _some(values: Any) -> str:
+    listed = values if isinstance(values, list) else [values]
+    return f"[{', '.join(map(str, listed[:4]))}{', ...' * (len(listed) > 4)}]"
 
 
 def independent_copies(pool: EnvironmentPool, count: int) -> list[gymnasium.Env]:

@@ -11,9 +11,11 @@ from fdtasil.probes.directions import USUAL_COUNT
 from fdtasil.probes.source import Probes
 from fdtasil.probes.stencils import EXACT, FORWARD
 from fdtasil.rollouts.environments import resolve_horizon
+from fdtasil.rollouts.trials import fingerprint
 from fdtasil.run.configuration import Configuration
 from fdtasil.run.presets import Preset, preset_of
 from fdtasil.run.subject import Subject
+from fdtasil.seeding import episode_seeds
 from fdtasil.student.architectures import Architecture
 from fdtasil.student.fit import Fit
 from fdtasil.student.view import StudentObservation, describe_view
@@ -62,10 +64,13 @@ class Arguments:
 
         Raises:
             SettingError: If the environment allows no such horizon.
+            EnvironmentFault: If it fails in its first steps.
         """
         given, source, expert = self.given, self.probes, subject.expert
         stored = given is not None and given.answers is not None
         calibrates = source is not None and self.preset.calibrates(source)
+        horizon = resolve_horizon(self.horizon, subject.pool) if subject.pool else 0
+        (start,) = episode_seeds(self.seed, "evaluation", 0, 1)
         return Configuration(
             expert=(expert.source or expert.name) if expert else None,
             expert_sha256=expert.sha256 if expert else None,
@@ -82,11 +87,12 @@ class Arguments:
             student=self.student,
             fit=self.fit,
             episodes=self.episodes,
-            horizon=resolve_horizon(self.horizon, subject.pool) if subject.pool else 0,
+            horizon=horizon,
             seed=self.seed,
             device=self.device,
             evaluation_episodes=self.evaluation_episodes if subject.comparable else 0,
             max_queries=self.max_queries,
+            fingerprint=fingerprint(subject.pool, start) if subject.pool else None,
         )
 
 

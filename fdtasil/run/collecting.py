@@ -3,9 +3,12 @@
 from collections import Counter
 from dataclasses import dataclass
 
+import numpy as np
+
 from fdtasil.demonstrations.dataset import Dataset
 from fdtasil.demonstrations.states import label
 from fdtasil.demonstrations.trainers import Situation, Trainer
+from fdtasil.errors import SettingError
 from fdtasil.experts.expert import Expert
 from fdtasil.progress import Progress
 from fdtasil.rollouts.behaviours import Behaviour, Policy
@@ -16,6 +19,9 @@ from fdtasil.run.checkpoints import Collected
 from fdtasil.seeding import episode_seeds, generator
 
 __all__ = ["Collecting"]
+
+_ASKED_AGAIN = 16  # states of an interrupted run
+_SAME = 1e-3  # of two answers, relative to the largest action
 
 
 @dataclass(frozen=True)
@@ -64,6 +70,33 @@ class Collecting:
         counts["terminated_episodes"] += int(episodes.terminated.sum())
         dataset = Dataset(states, None, None, boxes.low, boxes.high, self.pool.name)
         return Collected(dataset, first + len(episodes.valid), counts)
+
+    def check_kept(self, kept: Collected) -> None:
+        """Refuse to go on where another expert labelled the states that are there.
+
+        Args:
+            kept: What an interrupted run has collected.
+
+        Raises:
+            SettingError: If the expert answers otherwise than it did.
+        """
+        states = kept.dataset.demonstrations
+        chosen = np.linspace(0, len(states) - 1, min(len(states), _ASKED_AGAIN)).astype(int)
+        rows, stored = states.observations[chosen], states.actions[chosen]
+        answers = self.expert.ask(rows, "check")
+        apart = np.abs(answers - stored).max(axis=1)
+        bound = _SAME * float(np.abs(states.actions).max())
+        if (apart <= bound).all():
+            return
+        if np.abs(self.expert.ask(rows, "check") - answers).max() > bound:
+            return  # one that does not repeat itself either was let through the gate
+        worst = int(apart.argmax())
+        raise SettingError(
+            f"the run was begun with another expert: at state {chosen[worst]} it answered "
+            f"{np.round(stored[worst], 4).tolist()}, now {np.round(answers[worst], 4).tolist()}",
+            f"the expert that labelled the {len(states):,} states that are kept",
+            "resume with that expert, or start anew in another folder",
+        )
 
     def _behaviour(self, round_: int, student: Policy | None) -> Behaviour:
         """Return who acts in a round, which may take a few more episodes to find out."""

@@ -41,6 +41,8 @@ class Configuration:
         device: Where the student is trained.
         evaluation_episodes: Paired episodes of the evaluation; 0 where nothing is compared.
         max_queries: The most that the expert may be asked, or None.
+        fingerprint: Of the environment; see `rollouts/trials.py`. None where there is none, or it
+            does not repeat itself.
     """
 
     expert: str | None
@@ -63,6 +65,7 @@ class Configuration:
     device: str
     evaluation_episodes: int
     max_queries: int | None
+    fingerprint: dict[str, Any] | None
 
     def predicted_queries(self) -> dict[str, int]:
         """Return the rows that the run will ask the expert for, by purpose.

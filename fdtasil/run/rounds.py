@@ -1,6 +1,7 @@
 """The rounds of a run: collect, label, probe, train; each stage is kept before the next begins."""
 
 from collections import Counter
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,6 +16,7 @@ from fdtasil.run.checkpoints import (
     TRAINED,
     Checkpoints,
     Collected,
+    Stage,
     Trained,
 )
 from fdtasil.run.collecting import Collecting
@@ -94,7 +96,7 @@ class Rounds:
             new = self._recorded(self.collecting, round_, count, before, student)
             return self._probed(round_, new, before, lesson)
 
-        return self.checkpoints.once(round_, COLLECTED, collect)
+        return self._once(round_, COLLECTED, collect)
 
     def _recorded(
         self,
@@ -109,7 +111,23 @@ class Rounds:
 
         if self.run.probes is None:
             return record()  # the round is kept as a whole in a moment
-        return self.checkpoints.once(round_, RECORDED, record)
+        return self._once(round_, RECORDED, record)
+
+    def _once(
+        self, round_: int, stage: Stage[Collected], do: Callable[[], Collected]
+    ) -> Collected:
+        """Collect, or take up what was kept, if the expert is still the one that labelled it."""
+        made = list[Collected]()
+
+        def collect() -> Collected:
+            made.append(do())
+            return made[0]
+
+        found = self.checkpoints.once(round_, stage, collect)
+        if not made and round_ == 0 and self.collecting is not None:
+            with self.checkpoints.account.asked_before():
+                self.collecting.check_kept(found)
+        return found
 
     def _probed(
         self, round_: int, new: Collected, before: Collected | None, lesson: Lesson | None
