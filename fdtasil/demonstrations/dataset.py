@@ -2,7 +2,7 @@
 
 import io
 import json
-import zipfile
+from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
@@ -10,12 +10,15 @@ from typing import Any
 import numpy as np
 
 from fdtasil.demonstrations.states import Demonstrations
-from fdtasil.errors import SettingError, StorageError, first_line
+from fdtasil.errors import SettingError, StorageError
+from fdtasil.files.arrays import arrays_from_bytes
+from fdtasil.files.border import reads
+from fdtasil.files.reading import from_json, read_plain
 from fdtasil.files.storage import is_written, verify
 from fdtasil.probes.answers import Answers
 from fdtasil.probes.source import Probes
 
-__all__ = ["Dataset", "DatasetLike", "load_dataset"]
+__all__ = ["Dataset", "DatasetLike", "check_dataset", "load_dataset"]
 
 _VERSION = 1
 
@@ -71,21 +74,18 @@ class Dataset:
         return target.getvalue()
 
     @staticmethod
+    @reads(
+        "demonstrations",
+        "a demonstrations.npz written by fdtasil",
+        "check the path, or save again",
+    )
     def from_bytes(data: bytes) -> "Dataset":
         """Read what `to_bytes` wrote; nothing is unpickled.
 
         Raises:
             StorageError: If it is not such a file, or of a later version.
         """
-        try:
-            with np.load(io.BytesIO(data), allow_pickle=False) as arrays:
-                return _read(dict(arrays))
-        except (KeyError, TypeError, ValueError, OSError, EOFError, zipfile.BadZipFile) as error:
-            raise StorageError(
-                f"not demonstrations: {type(error).__name__} {first_line(error)}",
-                "a demonstrations.npz written by fdtasil",
-                "check the path, or save again",
-            ) from error
+        return _read(arrays_from_bytes(data))
 
 
 DatasetLike = Dataset | str | Path
@@ -99,15 +99,15 @@ def load_dataset(source: DatasetLike) -> Dataset:
         SettingError: If they are empty, of shapes that do not go together, or not finite.
     """
     if isinstance(source, Dataset):
-        return _checked(source)
+        return check_dataset(source)
     path = Path(source)
     file = path / "demonstrations.npz" if path.is_dir() else path
     try:
         if path.is_dir() and is_written(path):
             data = verify(path, [file.name])[file.name]
         else:
-            data = file.read_bytes()
-        return _checked(Dataset.from_bytes(data))
+            data = read_plain(file)
+        return check_dataset(Dataset.from_bytes(data))
     except OSError as error:
         if isinstance(error, StorageError):
             error.add_note(f"read from {file}")
@@ -119,8 +119,12 @@ def load_dataset(source: DatasetLike) -> Dataset:
         ) from error
 
 
-def _checked(dataset: Dataset) -> Dataset:
-    """Return a dataset that a student can be trained from: one NaN in it makes all weights NaN."""
+def check_dataset(dataset: Dataset) -> Dataset:
+    """Return a dataset that a student can be trained from: one NaN in it makes all weights NaN.
+
+    Raises:
+        SettingError: If it is empty, of shapes that do not go together, or not finite.
+    """
     states, answers = dataset.demonstrations, dataset.answers
     arrays = dict(vars(states)) | {"low": dataset.low, "high": dataset.high}
     shapes = {"observations": "Nn", "actions": "Nm", "taken": "Nm", "low": "m", "high": "m"}
@@ -142,6 +146,8 @@ def _checked(dataset: Dataset) -> Dataset:
                 f"({', '.join(letters)}) with {expected}, and N at least 1",
                 "record at least one episode, one row of each array for each state",
             )
+    if answers is not None:
+        _check_numbers(answers)
     for name in ("observations", "actions", "displacements", "values"):
         if name in arrays and not np.isfinite(arrays[name]).all():
             bad = np.flatnonzero([not np.isfinite(row).all() for row in arrays[name]])
@@ -154,16 +160,66 @@ def _checked(dataset: Dataset) -> Dataset:
     return dataset
 
 
-def _read(arrays: dict[str, np.ndarray]) -> Dataset:
-    about = json.loads(arrays["about"].tobytes())
+def _check_numbers(answers: Answers) -> None:
+    numbers, rows = answers.numbers, len(answers.displacements)
+    if numbers.size and not (numbers.min() >= 0 and numbers.max() < rows):
+        raise SettingError(
+            f"answers along the displacements {numbers.min()} to {numbers.max()}, of {rows}",
+            f"numbers from 0 to {rows - 1}",
+            "save the demonstrations again, with all displacements",
+        )
+
+
+_KINDS: dict[str, Any] = {
+    **dict.fromkeys(("observations", "actions", "taken", "low", "high"), np.float32),
+    **dict.fromkeys(("displacements", "values"), np.float32),
+    **dict.fromkeys(("episode", "round", "numbers"), np.int32),
+    **dict.fromkeys(("rewards", "gain"), np.float64),
+    "terminated": np.bool_,
+}
+"""Types of the arrays, by name; those of others are turned into these where nothing is lost."""
+
+
+def _as_kind(name: str, array: np.ndarray) -> np.ndarray:
+    kind = np.dtype(_KINDS[name])
+    flags = kind == np.bool_ and array.dtype.kind in "iu" and ((array == 0) | (array == 1)).all()
+    if not flags and not np.can_cast(array.dtype, kind, "same_kind"):
+        raise ValueError(f"{name} of the type {array.dtype}")
+    if kind.kind == "i" and array.size:
+        room = np.iinfo(kind)
+        if int(array.min()) < room.min or int(array.max()) > room.max:
+            raise ValueError(f"{name} beyond {kind}")
+    with np.errstate(over="ignore"):  # infinite then, which is refused as such
+        return array.astype(kind, copy=False)
+
+
+def _read(arrays: Mapping[str, np.ndarray]) -> Dataset:
+    about = from_json(arrays["about"].tobytes())
     if about["version"] > _VERSION:
         raise ValueError(f"version {about['version']} is newer than this fdtasil")
-    names = [field.name for field in fields(Demonstrations)]
-    demonstrations = Demonstrations(*(arrays[name] for name in names))
+    spec, environment = about["probes"], about["environment"]
+    if not isinstance(spec, str) or not isinstance(environment, str):
+        raise TypeError("texts in about that are none")
+    typed = {name: _as_kind(name, array) for name, array in arrays.items() if name in _KINDS}
+    demonstrations = Demonstrations(*(typed[field.name] for field in fields(Demonstrations)))
     answers = None
-    if "values" in arrays:
-        bank, numbers, values = (arrays[name] for name in ("displacements", "numbers", "values"))
-        answers = Answers(bank, numbers, values, float(arrays["gain"]))
-    probes = Probes.parse(about["probes"])
-    bounds = arrays["low"], arrays["high"]
-    return Dataset(demonstrations, probes, answers, *bounds, about["environment"])
+    if "values" in typed:
+        bank, numbers, values = (typed[name] for name in ("displacements", "numbers", "values"))
+        gain = float(typed["gain"])
+        if not 0 < gain < np.inf:
+            raise ValueError(f"gain {gain}")
+        answers = Answers(bank, numbers, values, gain)
+    bounds = typed["low"], typed["high"]
+    return Dataset(demonstrations, _probes(spec, answers), answers, *bounds, environment)
+
+
+def _probes(spec: str, answers: Answers | None) -> Probes | None:
+    """Read the source that answers are of; there is one where there are answers."""
+    probes = Probes.parse(spec)
+    if (probes is None) != (answers is None):
+        raise ValueError(f"probes {spec!r} {'without' if answers is None else 'with'} answers")
+    if probes is not None and answers is not None and answers.values.ndim == 4:
+        stencil, points = probes.stencil, answers.values.shape[2]
+        if stencil is not None and not stencil.exact and points != len(stencil.offsets):
+            raise ValueError(f"{points} answers along each probe of {spec!r}")
+    return probes

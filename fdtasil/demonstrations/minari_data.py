@@ -1,6 +1,8 @@
 """Minari datasets in and out; the package minari (`[data]`) is loaded when one is."""
 
 import importlib
+import os
+from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING, Any
 
 import gymnasium
@@ -8,7 +10,12 @@ import numpy as np
 
 from fdtasil.demonstrations.dataset import Dataset
 from fdtasil.demonstrations.states import Demonstrations
-from fdtasil.errors import SettingError, StorageError, first_line
+from fdtasil.errors import FdtasilError, SettingError, StorageError, first_line, shown
+from fdtasil.files.border import reads
+from fdtasil.files.hdf5 import check_hdf5
+from fdtasil.files.names import check_no_links, stays_inside
+from fdtasil.files.reading import from_json, read_plain
+from fdtasil.files.storage import remove_folder
 
 if TYPE_CHECKING:
     import minari
@@ -32,23 +39,41 @@ def from_minari(source: "str | minari.MinariDataset") -> Dataset:
         StorageError: If there is no such dataset.
         SettingError: If its spaces are not flat boxes, or minari is not installed.
     """
-    minari = _minari()
-    try:
-        data = minari.load_dataset(source) if isinstance(source, str) else source
-    except (FileNotFoundError, ValueError, KeyError) as error:
-        raise StorageError(
-            f"no Minari dataset {source!r} on this machine",
-            "one that `minari list local` shows",
-            f"minari download {source}",
-        ) from error
+    name = source if isinstance(source, str) else source.spec.dataset_id
+    read = reads(
+        f"the Minari dataset {shown(name)!r}",
+        "a dataset whose files hold their own data, without links",
+        "download it again, and do not use this one",
+        passes=FdtasilError,
+    )
+    return read(_dataset_of)(source, _minari())
+
+
+def _dataset_of(source: "str | minari.MinariDataset", minari: Any) -> Dataset:
+    if isinstance(source, str):
+        folder = _folder_of(source)
+        if not (folder / "data").is_dir():
+            raise StorageError(
+                f"no Minari dataset {source!r} on this machine",
+                "one that `minari list local` shows",
+                f"minari download {source}",
+            )
+        _check_files(folder / "data")
+        data = minari.load_dataset(source)
+    else:
+        data = source
+        _check_files(Path(data.storage.data_path))
     spaces = (data.observation_space, data.action_space)
     if not all(isinstance(s, gymnasium.spaces.Box) and len(s.shape) == 1 for s in spaces):
         raise SettingError(
-            f"a dataset with observations {spaces[0]} and actions {spaces[1]}",
+            f"a dataset with observations {shown(spaces[0])} and actions {shown(spaces[1])}",
             "boxes with one dimension",
             "flatten it, or choose another",
         )
-    episodes = [_read(number, episode) for number, episode in enumerate(data.iterate_episodes())]
+    sizes = spaces[0].shape[0], spaces[1].shape[0]
+    episodes = [
+        _read(number, episode, sizes) for number, episode in enumerate(data.iterate_episodes())
+    ]
     if not episodes:
         raise StorageError(f"{source!r} has no episodes", "at least one", "choose another dataset")
     states = episodes[0]
@@ -56,7 +81,42 @@ def from_minari(source: "str | minari.MinariDataset") -> Dataset:
         states = states + episode
     low, high = (np.asarray(bound, np.float32) for bound in (spaces[1].low, spaces[1].high))
     name = data.env_spec.id if data.env_spec else data.spec.dataset_id
-    return Dataset(states, None, None, low, high, name)
+    return Dataset(states, None, None, low, high, str(name))
+
+
+def _folder_of(dataset_id: str) -> Path:
+    """Return where a dataset of a name lies, or would.
+
+    Raises:
+        StorageError: If the name is a path that leads elsewhere.
+    """
+    if not stays_inside(dataset_id):
+        raise StorageError(
+            f"a Minari dataset named {shown(dataset_id)!r}",
+            "an id such as cheetah/sac-v0",
+            "name it so: it is kept in Minari's own folder",
+        )
+    # As Minari finds it; its own function makes folders on the way.
+    root = os.environ.get("MINARI_DATASETS_PATH") or Path.home() / ".minari" / "datasets"
+    return Path(root, dataset_id)
+
+
+_METADATA, _METADATA_LIMIT = "metadata.json", 2**24
+
+
+def _check_files(folder: Path) -> None:
+    """Refuse a dataset that would have other files read, or modules imported.
+
+    Raises:
+        ValueError: If it would.
+    """
+    check_no_links(folder)
+    metadata = from_json(read_plain(folder / _METADATA, _METADATA_LIMIT))
+    if not {"observation_space", "action_space"} <= metadata.keys():
+        # Minari would make the environment that the file names, from any module.
+        raise ValueError("its metadata do not say its spaces")
+    for file in sorted(folder.glob("**/*.hdf5")):
+        check_hdf5(file)
 
 
 def to_minari(dataset: Dataset, dataset_id: str, **about: str) -> "minari.MinariDataset":
@@ -98,6 +158,10 @@ def to_minari(dataset: Dataset, dataset_id: str, **about: str) -> "minari.Minari
                 infos=infos,
             )
         )
+    folder = _folder_of(dataset_id)
+    # Minari makes the folder, and one for each part of the name before it.
+    parts = len(PurePosixPath(dataset_id).parts)
+    made = [place for place in (folder, *folder.parents)[:parts] if not place.exists()]
     try:
         return minari.create_dataset_from_buffers(
             dataset_id,
@@ -107,27 +171,37 @@ def to_minari(dataset: Dataset, dataset_id: str, **about: str) -> "minari.Minari
             requirements=[],
             **about,
         )
-    except (OSError, ValueError, AssertionError) as error:
+    except BaseException as error:
+        if made:
+            remove_folder(made[-1])
+        if not isinstance(error, Exception):
+            raise
         raise StorageError(
-            f"Minari can't write {dataset_id!r}: {first_line(error)}",
+            f"Minari can't write {shown(dataset_id)!r}: {first_line(error)}",
             "a new id such as cheetah/sac-v0",
-            f"choose another id, or `minari delete {dataset_id}`",
+            f"choose another id, or `minari delete {shown(dataset_id)}`",
         ) from error
 
 
-def _read(number: int, episode: Any) -> Demonstrations:
-    steps = len(episode.rewards)
+def _read(number: int, episode: Any, sizes: tuple[int, int]) -> Demonstrations:
+    steps, (n, m) = len(episode.rewards), sizes
     taken = np.asarray(episode.actions, np.float32)[:steps]
     infos = episode.infos or {}
     labels = np.asarray(infos.get(EXPERT_ACTION, taken), np.float32)[:steps]
+    observations = np.asarray(episode.observations, np.float32)[:steps]
+    rewards = np.asarray(episode.rewards, np.float64)
+    terminated = np.asarray(episode.terminations, bool)
+    shapes = [array.shape for array in (observations, taken, labels, rewards, terminated)]
+    if shapes != [(steps, n), (steps, m), (steps, m), (steps,), (steps,)]:
+        raise ValueError(f"episode {number} of {steps} steps has arrays of shapes {shapes}")
     return Demonstrations(
-        np.asarray(episode.observations, np.float32)[:steps],
+        observations,
         labels,
         np.full(steps, number, np.int32),
         np.zeros(steps, np.int32),
         taken,
-        np.asarray(episode.rewards, np.float64),
-        np.asarray(episode.terminations, bool),
+        rewards,
+        terminated,
     )
 
 

@@ -1,14 +1,69 @@
 """Reading a file that somebody else made: a plain one, and not more of it than there may be."""
 
+import errno
+import json
+import os
+import stat
 from pathlib import Path
+from typing import Any
 
-from fdtasil.errors import ExpertError
+from fdtasil.errors import ExpertError, first_line
 
-__all__ = ["read_limited"]
+__all__ = ["FILE_LIMIT", "from_json", "read_limited", "read_plain"]
+
+FILE_LIMIT = 2**34
+"""Bytes that a file of ours may have."""
+_JSON_LIMIT = 2**25  # a hundred times the longest report; parsed it takes fifty times as much
+
+
+def read_plain(path: Path, limit: int = FILE_LIMIT, *, follow: bool = True) -> bytes:
+    """Read a plain file of at most `limit` bytes.
+
+    A named pipe or a device may be waited for without end, so it is not even begun.
+
+    Args:
+        path: The file.
+        limit: The most that it may have.
+        follow: Whether the path itself may be a link.
+
+    Raises:
+        OSError: If it is larger, no plain file, or can't be read.
+    """
+    flags = os.O_RDONLY | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
+    if not follow:
+        flags |= getattr(os, "O_NOFOLLOW", 0)
+        if path.is_symlink():
+            raise OSError(errno.ELOOP, "it is a link")
+    with open(os.open(path, flags | getattr(os, "O_CLOEXEC", 0)), "rb") as file:
+        about = os.fstat(file.fileno())
+        if stat.S_ISDIR(about.st_mode):
+            raise IsADirectoryError(errno.EISDIR, os.strerror(errno.EISDIR))
+        if not stat.S_ISREG(about.st_mode):
+            raise OSError(errno.EINVAL, "it is no plain file")
+        if about.st_size > limit:
+            raise OSError(errno.EFBIG, f"it has {about.st_size:,} bytes, of at most {limit:,}")
+        data = file.read(limit + 1)
+    if len(data) > limit:
+        raise OSError(errno.EFBIG, f"it grew beyond {limit:,} bytes")
+    return data
+
+
+def from_json(data: bytes) -> Any:
+    """Return what JSON says.
+
+    Raises:
+        ValueError: If it is none, too long, or too deep.
+    """
+    if len(data) > _JSON_LIMIT:
+        raise ValueError(f"{len(data):,} bytes of JSON, of at most {_JSON_LIMIT:,}")
+    try:
+        return json.loads(data)
+    except (RecursionError, MemoryError) as error:
+        raise ValueError(f"JSON that is too deep: {first_line(error)}") from error
 
 
 def read_limited(path: Path, limit: int, what: str, next_step: str = "check the path") -> bytes:
-    """Read a file of 1 to `limit` bytes.
+    """Read a plain file of 1 to `limit` bytes.
 
     Args:
         path: The file.
@@ -17,17 +72,17 @@ def read_limited(path: Path, limit: int, what: str, next_step: str = "check the 
         next_step: What to do where it can't be read.
 
     Raises:
-        ExpertError: If it is larger, empty, or can't be read.
+        ExpertError: If it is larger, empty, no plain file, or can't be read.
     """
     try:
         size = path.stat().st_size
-        if not 0 < size <= limit:
+        if path.is_file() and not 0 < size <= limit:
             raise ExpertError(
                 f"{path} has {size:,} bytes",
                 f"1 to {limit:,} bytes",
                 "check that this is the right file",
             )
-        return path.read_bytes()
+        return read_plain(path, limit)
     except OSError as error:
         raise ExpertError(
             f"{path.absolute()} can't be read: {error.strerror}",

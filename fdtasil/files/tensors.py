@@ -7,7 +7,8 @@ from typing import Any
 import safetensors.torch
 from torch import Tensor
 
-from fdtasil.errors import StorageError, first_line
+from fdtasil.files.border import reads
+from fdtasil.files.reading import from_json
 
 __all__ = ["tensors_from_bytes", "tensors_to_bytes"]
 
@@ -36,13 +37,12 @@ def tensors_from_bytes(data: bytes, entry: str, what: str) -> tuple[dict[str, Te
     Raises:
         StorageError: If it is no such file.
     """
-    try:
-        tensors = safetensors.torch.load(data)
-        size = int.from_bytes(data[:8], "little")
-        return tensors, json.loads(json.loads(data[8 : 8 + size])["__metadata__"][entry])
-    except (safetensors.SafetensorError, KeyError, TypeError, ValueError) as error:
-        raise StorageError(
-            f"not {what}: {type(error).__name__} {first_line(error)}",
-            "a file written by fdtasil",
-            "check the path, or save again",
-        ) from error
+    wanted = what, "a file written by fdtasil", "check the path, or save again"
+    return reads(*wanted)(_read)(data, entry)
+
+
+def _read(data: bytes, entry: str) -> tuple[dict[str, Tensor], Any]:
+    tensors = safetensors.torch.load(data)
+    size = int.from_bytes(data[:8], "little")
+    about = from_json(data[8 : 8 + size])["__metadata__"][entry]
+    return tensors, from_json(about.encode())

@@ -2,30 +2,35 @@
 
 import csv
 import io
-import json
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from fdtasil.demonstrations.dataset import Dataset
+from fdtasil.demonstrations.dataset import Dataset, check_dataset
 from fdtasil.demonstrations.states import Demonstrations
-from fdtasil.errors import SettingError, StorageError
+from fdtasil.errors import first_line, warn
 from fdtasil.experts.expert import rows_text
 from fdtasil.experts.onnx_expert import COLUMNS
-from fdtasil.files.storage import to_json, verify, write_bytes, write_folder
+from fdtasil.files.border import reads
+from fdtasil.files.lock import locked
+from fdtasil.files.plain import without_infinities
+from fdtasil.files.reading import from_json
+from fdtasil.files.run_format import CONFIG, check_free, stamped, unstamped
+from fdtasil.files.storage import add_to_folder, to_json, verify, write_bytes, write_folder
 from fdtasil.probes.answers import Answers
 from fdtasil.results.evaluation import Evaluation
 from fdtasil.results.figures import FIGURES
 from fdtasil.student.exports import export
 from fdtasil.student.policy import Student
-from fdtasil.student.view import StudentObservation, View
+from fdtasil.student.view import StudentObservation, Unseen, View
 
-__all__ = ["Distilled"]
+__all__ = ["Distilled", "write_run"]
 
 _PARITY_STATES = 1000
+_PATIENCE = 60.0  # seconds that save() waits for another process that saves into the folder
 
 
 @dataclass(frozen=True, repr=False)
@@ -117,23 +122,19 @@ class Distilled:
 
         Files: config.json, report.json, progress.csv, demonstrations.npz, student.safetensors,
         student.onnx, the pictures of `FIGURES` that there is something to draw for, and last a
-        manifest.
+        manifest. What can't be drawn or exported is left out with a warning.
+
+        Args:
+            folder: One that is missing, empty, or a run's, which is replaced.
 
         Raises:
-            StorageError: If a file can't be written; finished files stay whole.
+            StorageError: If a file can't be written, or the folder is none of these; finished
+                files stay whole.
         """
-        files = {
-            "config.json": to_json(self.settings),
-            "progress.csv": _csv(self.history),
-            "demonstrations.npz": self.dataset.to_bytes(),
-            **{name: self.export_bytes(name) for name in ("student.safetensors", "student.onnx")},
-            "report.json": to_json(self.report),
-        }
-        for name, draw in FIGURES.items():
-            picture = draw(self)
-            if picture is not None:
-                files[f"figures/{name}.png"] = picture
-        write_folder(Path(folder), files)
+        place = Path(folder).absolute()
+        check_free(place)
+        with locked(place, _PATIENCE):
+            write_run(self, place)
         return Path(folder)
 
     @classmethod
@@ -150,28 +151,30 @@ class Distilled:
         Raises:
             StorageError: If a file is missing, changed since, or not one of ours.
         """
-        files = verify(Path(folder))
-        try:
-            report = json.loads(files["report.json"])
-            settings = json.loads(files["config.json"])
-            dataset = Dataset.from_bytes(files["demonstrations.npz"])
-            evaluation = report["evaluation"]
-            return cls(
-                student=Student.from_bytes(files["student.safetensors"]),
-                evaluation=Evaluation.from_json(evaluation) if evaluation else None,
-                history=_read_csv(files["progress.csv"]),
-                queries=report["queries"],
-                settings=settings,
-                report=report,
-                dataset=dataset,
-                view=_stored_view(settings["student_obs"], student_obs, dataset),
-            )
-        except (KeyError, TypeError, ValueError) as error:
-            raise StorageError(
-                f"{folder} can't be read: {type(error).__name__} {error}",
-                "a run folder written by this version of fdtasil",
-                "check the path, or run distill again",
-            ) from error
+        read = reads(
+            f"a run in {folder}",
+            "a run folder written by this version of fdtasil",
+            "check the path, or run distill again",
+        )
+        return read(cls._read)(Path(folder), student_obs)
+
+    @classmethod
+    def _read(cls, folder: Path, student_obs: StudentObservation | None) -> "Distilled":
+        files = verify(folder)
+        settings = unstamped(files[CONFIG], folder / CONFIG, older=True)
+        report = from_json(files["report.json"])
+        dataset = check_dataset(Dataset.from_bytes(files["demonstrations.npz"]))
+        evaluation = report["evaluation"]
+        return cls(
+            student=Student.from_bytes(files["student.safetensors"]),
+            evaluation=Evaluation.from_json(evaluation) if evaluation else None,
+            history=_read_csv(files["progress.csv"]),
+            queries=_read_queries(report["queries"]),
+            settings=settings,
+            report=report,
+            dataset=dataset,
+            view=_stored_view(settings["student_obs"], student_obs, dataset),
+        )
 
     def _metadata(self) -> Mapping[str, str]:
         low, high = self.student.low.tolist(), self.student.high.tolist()
@@ -192,6 +195,66 @@ class Distilled:
         return metadata
 
 
+def write_run(result: Distilled, folder: Path) -> None:
+    """Write a result's folder, whose lock the caller has.
+
+    What was trained is saved before anything is tried that may fail: a picture, an export.
+
+    Raises:
+        StorageError: If a file can't be written; finished files stay whole.
+    """
+    report, places = without_infinities(result.report)
+    notes = list[str]()
+    if places:
+        shown = ", ".join(places[:5]) + (f" and {len(places) - 5} more" * (len(places) > 5))
+        _note(notes, f"report.json has null for numbers that are not finite: {shown}")
+    core = {
+        CONFIG: stamped(result.settings),
+        "progress.csv": _csv(result.history),
+        "demonstrations.npz": result.dataset.to_bytes(),
+        "student.safetensors": result.export_bytes("student.safetensors"),
+        "report.json": _with_notes(report, notes),
+    }
+    write_folder(folder, core)
+    said = len(notes)
+    extra = _attempted({"student.onnx": lambda: result.export_bytes("student.onnx")}, notes)
+    drawn = {f"figures/{name}.png": _drawing(draw, result) for name, draw in FIGURES.items()}
+    extra |= _attempted(drawn, notes)
+    if len(notes) > said:
+        extra["report.json"] = _with_notes(report, notes)
+    if extra:
+        add_to_folder(folder, extra)
+
+
+def _drawing(draw: Callable[[Any], bytes | None], result: Distilled) -> Callable[[], bytes | None]:
+    return lambda: draw(result)
+
+
+def _attempted(
+    wanted: Mapping[str, Callable[[], bytes | None]], notes: list[str]
+) -> dict[str, bytes]:
+    """Make files by name; those that can't be made are warned of."""
+    made = {}
+    for name, make in wanted.items():
+        try:
+            data = make()
+        except Exception as error:  # fonts, latex, a user's matplotlibrc: they raise anything
+            _note(notes, f"{name} is left out: {type(error).__name__}: {first_line(error)}")
+            continue
+        if data is not None:
+            made[name] = data
+    return made
+
+
+def _note(notes: list[str], message: str) -> None:
+    notes.append(message)
+    warn(message)
+
+
+def _with_notes(report: Mapping[str, Any], notes: list[str]) -> bytes:
+    return to_json({**report, "warnings": [*report["warnings"], *notes]})
+
+
 def _stored_view(
     stored: list[int] | str | None, given: StudentObservation | None, dataset: Dataset
 ) -> View:
@@ -200,15 +263,13 @@ def _stored_view(
         return View.of(stored, states)
     if given is not None:
         return View.of(given, states)
+    return View(Unseen(stored), None, 0, np.ones(states.shape[1], bool))
 
-    def missing(rows: np.ndarray) -> np.ndarray:
-        raise SettingError(
-            f"the student sees through {stored}, which no file can hold",
-            "the function itself",
-            "pass it: Distilled.load(folder, student_obs=...)",
-        )
 
-    return View(missing, None, 0, np.ones(states.shape[1], bool))
+def _read_queries(queries: Any) -> dict[str, int]:
+    if not isinstance(queries, dict) or not all(type(rows) is int for rows in queries.values()):
+        raise TypeError("queries that are no numbers by purpose")
+    return queries
 
 
 def _csv(history: list[dict[str, float]]) -> bytes:

@@ -8,7 +8,7 @@ from typing import Any
 
 from fdtasil.errors import SettingError
 
-__all__ = ["Account"]
+__all__ = ["Account", "check_account"]
 
 
 class Account:
@@ -72,6 +72,7 @@ class Account:
     def take_up(self, earlier: dict[str, Any]) -> None:
         """Go on from a checkpoint; what this process asked before, the interrupted one had too."""
         self._earlier, self._before = earlier, dict(self._ledger)
+        self._repeated.clear()  # the whole ledger is
         self.start_clock()
 
     @contextmanager
@@ -96,3 +97,23 @@ class Account:
                 f"at most max_queries={most:,}",
                 "raise max_queries, or leave out resample",
             )
+
+
+def check_account(earlier: object) -> None:
+    """Refuse what `Account.to_json` has not written.
+
+    Raises:
+        TypeError: If it is something else.
+    """
+    if not isinstance(earlier, dict):
+        raise TypeError("an account that is none")
+    queries, notes = earlier["queries"], earlier["notes"]
+    good = (
+        isinstance(queries, dict)
+        and all(type(rows) is int for rows in (*queries.values(), earlier["again"]))
+        and isinstance(notes, list)
+        and all(isinstance(note, str) for note in notes)
+        and type(earlier["seconds"]) in (int, float)
+    )
+    if not good:
+        raise TypeError("an account that is none")

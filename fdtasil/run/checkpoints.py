@@ -1,20 +1,23 @@
 """The stages of a round, each kept before the next begins, and taken up after an interruption."""
 
 import io
-import json
 from collections import Counter
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from fdtasil.demonstrations.dataset import Dataset
+from fdtasil.demonstrations.dataset import Dataset, check_dataset
+from fdtasil.files.arrays import array_from_bytes
+from fdtasil.files.border import reads
+from fdtasil.files.reading import from_json
 from fdtasil.files.storage import to_json
 from fdtasil.probes.calibration import Calibration
-from fdtasil.run.account import Account
+from fdtasil.run.account import Account, check_account
 from fdtasil.run.asking import Asking
 from fdtasil.run.folder import RunFolder
+from fdtasil.student.fit_state import check_history
 from fdtasil.student.policy import Student
 
 __all__ = [
@@ -96,15 +99,28 @@ _ABOUT = "about.json"
 _RUN = "run.json"
 
 
+_STAGE = reads(
+    "a stage of this run", "a checkpoint of the same run", "start the run anew in another folder"
+)
+
+
+def _count(about: dict[str, Any], name: str) -> int:
+    if type(about[name]) is not int or about[name] < 0:
+        raise TypeError(f"{name} of {about[name]!r}")
+    return about[name]
+
+
 def _write_collected(now: Collected) -> Files:
     about = {"episodes": now.episodes, "counts": dict(now.counts)}
     return {_ABOUT: to_json(about), "demonstrations.npz": now.dataset.to_bytes()}
 
 
+@_STAGE
 def _read_collected(files: Files) -> Collected:
-    about = json.loads(files[_ABOUT])
-    dataset = Dataset.from_bytes(files["demonstrations.npz"])
-    return Collected(dataset, about["episodes"], Counter(about["counts"]))
+    about = from_json(files[_ABOUT])
+    counts = {name: _count(about["counts"], name) for name in about["counts"]}
+    dataset = check_dataset(Dataset.from_bytes(files["demonstrations.npz"]))
+    return Collected(dataset, _count(about, "episodes"), Counter(counts))
 
 
 def _write_values(values: np.ndarray) -> Files:
@@ -113,16 +129,21 @@ def _write_values(values: np.ndarray) -> Files:
     return {"values.npy": target.getvalue()}
 
 
+@_STAGE
 def _read_values(files: Files) -> np.ndarray:
-    return np.load(io.BytesIO(files["values.npy"]), allow_pickle=False)
+    values = array_from_bytes(files["values.npy"])
+    if values.dtype != np.float32 or values.ndim != 4:
+        raise ValueError(f"answers of {values.dtype} and shape {values.shape}")
+    return values
 
 
 def _write_halfway(now: Halfway) -> Files:
     return {_ABOUT: to_json({"sample": now.sample}), "fit.safetensors": now.fit}
 
 
+@_STAGE
 def _read_halfway(files: Files) -> Halfway:
-    return Halfway(files["fit.safetensors"], json.loads(files[_ABOUT])["sample"])
+    return Halfway(files["fit.safetensors"], _count(from_json(files[_ABOUT]), "sample"))
 
 
 def _write_trained(now: Trained) -> Files:
@@ -130,10 +151,23 @@ def _write_trained(now: Trained) -> Files:
     return {_ABOUT: to_json(about), "student.safetensors": now.student.to_bytes()}
 
 
+@_STAGE
 def _read_trained(files: Files) -> Trained:
-    about = json.loads(files[_ABOUT])
+    about = from_json(files[_ABOUT])
+    check_history(about["history"])
+    if not about["history"]:
+        raise ValueError("a history without an entry")
     student = Student.from_bytes(files["student.safetensors"])
-    return Trained(student, about["history"], about["steps"])
+    return Trained(student, about["history"], _count(about, "steps"))
+
+
+@_STAGE
+def _read_run(files: Files) -> tuple[Calibration | None, dict[str, Any]]:
+    """Return the calibration and the account that every checkpoint keeps."""
+    run = from_json(files[_RUN])
+    check_account(run["account"])
+    found = run["calibration"]
+    return (None if found is None else Calibration.from_json(found)), run["account"]
 
 
 RECORDED = Stage("recorded", _write_collected, _read_collected)
@@ -201,11 +235,12 @@ class Checkpoints:
         files = self.folder.load(round_, stage.name)
         if files is None:
             return None
-        run = json.loads(files[_RUN])
-        if run["calibration"] is not None:
-            self.asking.take_up(Calibration.from_json(run["calibration"]))
-        self.account.take_up(run["account"])
-        return stage.read(files)
+        calibration, account = _read_run(files)
+        content = stage.read(files)
+        if calibration is not None:
+            self.asking.take_up(calibration)
+        self.account.take_up(account)
+        return content
 
     def once(self, round_: int, stage: Stage[Content], do: Callable[[], Content]) -> Content:
         """Return what was kept of a stage, or do it and keep it."""

@@ -77,7 +77,7 @@ class Log:
                 "the package tensorboard",
                 'pip install "fdtasil[tb]"',
             )
-        self._folder, self._formats = Path(folder), formats
+        self._folder, self._formats = Path(folder).absolute(), formats
         self._logger: Any = None
 
     def __call__(self, event: Event) -> None:

@@ -1,24 +1,27 @@
 """A run's folder while the run goes on: its configuration, its checkpoints, and going on."""
 
-import json
-import shutil
+import re
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
 from fdtasil.errors import SettingError, StorageError, warn
 from fdtasil.files.lock import locked
-from fdtasil.files.storage import is_written, to_json, verify, write_bytes, write_folder
+from fdtasil.files.names import check_no_links, inside
+from fdtasil.files.reading import read_plain
+from fdtasil.files.run_format import CHECKPOINTS, CONFIG, check_free, stamped, unstamped
+from fdtasil.files.storage import is_written, remove_folder, verify, write_bytes, write_folder
+from fdtasil.rollouts.trials import other_environment
 
 __all__ = ["CHECKPOINT_SECONDS", "RunFolder", "open_run_folder"]
 
 CHECKPOINT_SECONDS = 20.0
 """Time between two checkpoints inside a stage; when they are taken changes no byte."""
 
-_CONFIG = "config.json"
-_CHECKPOINTS = "checkpoints"
+_CONFIG_LIMIT = 2**24
+_FINGERPRINT = "fingerprint"
 _FREE = "max_queries"  # what a run is allowed to ask changes none of its bytes
 
 
@@ -39,22 +42,28 @@ def open_run_folder(
         SettingError: If there is nothing to resume, the folder's run has another configuration
             (other versions and another device are warned of), or a new run would overwrite an
             unfinished one.
-        StorageError: If the folder can't be written, or another process writes it.
+        StorageError: If the folder can't be written, another process writes it, it is no run's,
+            or of another format.
     """
     folder = RunFolder(path, config)
     if path is None:
         yield folder
         return
+    if resume:
+        check_no_links(path)
+    else:
+        check_free(path)
     before = _read_config(path) if resume else None
     going_on = f'go on with resume="{path}" (--resume {path})'
     with locked(path):
         if before is not None:
             _check_same(before, config, path, finished=folder.finished)
         elif folder.begun:
+            _read_config(path)  # of another format, it can't be gone on with
             raise SettingError(
                 f"{path} holds an unfinished run",
                 "an empty folder, or a finished run (which is replaced)",
-                f"{going_on}, or remove the folder",
+                f"{going_on}, or choose another folder",
             )
         try:
             yield folder
@@ -87,12 +96,12 @@ class RunFolder:
     @property
     def begun(self) -> bool:
         """Whether there is a checkpoint to go on from."""
-        return self._path is not None and any((self._path / _CHECKPOINTS).glob("*/*"))
+        return self._path is not None and any((self._path / CHECKPOINTS).glob("*/*"))
 
     @property
     def finished(self) -> bool:
         """Whether the folder holds a finished run."""
-        if self._path is None or (self._path / _CHECKPOINTS).exists():
+        if self._path is None or (self._path / CHECKPOINTS).exists():
             return False
         return is_written(self._path)
 
@@ -107,21 +116,21 @@ class RunFolder:
             return
         # Not beside the files of a finished run, which stay whole until this one is saved, and
         # not before there is something to go on from.
-        config = self._path / _CHECKPOINTS / _CONFIG
+        config = inside(self._path, f"{CHECKPOINTS}/{CONFIG}")
         if not config.exists():
-            write_bytes(config, to_json(self._config))
-        stages = self._path / _CHECKPOINTS / str(round_)
-        write_folder(stages / f"{stage}-{number}", files())
-        for older in _numbered(stages, stage):
+            write_bytes(config, stamped(self._config))
+        name = f"{CHECKPOINTS}/{round_}/{stage}-{number}"
+        write_folder(inside(self._path, name), files())
+        for older in _numbered(self._path, round_, stage):
             if older.name != f"{stage}-{number}":
-                shutil.rmtree(older, ignore_errors=True)
+                _drop(older)
         self._saved = time.monotonic()
 
     def load(self, round_: int, stage: str) -> dict[str, bytes] | None:
         """Return the newest whole checkpoint of a stage, or None."""
         if self._path is None:
             return None
-        for folder in _numbered(self._path / _CHECKPOINTS / str(round_), stage):
+        for folder in _numbered(self._path, round_, stage):
             if not is_written(folder):
                 continue  # the run ended while it was written
             try:
@@ -133,18 +142,35 @@ class RunFolder:
 
     def close(self) -> None:
         """Drop the checkpoints of a run that is saved."""
-        if self._path is not None:
-            shutil.rmtree(self._path / _CHECKPOINTS, ignore_errors=True)
+        if self._path is None:
+            return
+        checkpoints = inside(self._path, CHECKPOINTS)
+        for round_ in sorted(checkpoints.glob("*/")):
+            _drop(round_)  # first: without their configuration they would be nobody's
+        _drop(checkpoints)
+
+
+def _drop(folder: Path) -> None:
+    with suppress(StorageError):  # it is of no use any more, and does no harm
+        remove_folder(folder)
 
 
 def _read_config(path: Path) -> dict[str, Any]:
-    unfinished, finished = path / _CHECKPOINTS / _CONFIG, path / _CONFIG
+    """Return the configuration of the run in a folder, the unfinished one if there are two."""
+    unfinished = inside(path, f"{CHECKPOINTS}/{CONFIG}")
+    config = unfinished if unfinished.exists() else inside(path, CONFIG)
     try:
-        return json.loads((unfinished if unfinished.exists() else finished).read_bytes())
+        return unstamped(
+            read_plain(config, _CONFIG_LIMIT, follow=False),
+            config,
+            older=not (path / CHECKPOINTS).exists(),
+        )
+    except StorageError:
+        raise
     except (OSError, ValueError) as error:
         raise SettingError(
             f"{path} holds no run to resume ({type(error).__name__})",
-            f"a folder with a {_CONFIG}",
+            f"a folder with a {CONFIG}",
             "check the path, or start the run with out= (--out)",
         ) from error
 
@@ -152,9 +178,17 @@ def _read_config(path: Path) -> dict[str, Any]:
 def _check_same(
     before: dict[str, Any], now: dict[str, Any], path: Path, *, finished: bool
 ) -> None:
-    changed = _differences({**before, _FREE: None}, {**now, _FREE: None})
+    left_out = {_FREE: None, _FINGERPRINT: None}
+    if before.get("expert_sha256") is not None and before["expert_sha256"] == now["expert_sha256"]:
+        left_out["expert"] = None  # the same file, wherever it lies now
+    changed = _differences({**before, **left_out}, {**now, **left_out})
     surroundings = [change for change in changed if change.startswith(("versions.", "device "))]
     settings = [change for change in changed if change not in surroundings]
+    other = other_environment(before.get(_FINGERPRINT), now.get(_FINGERPRINT))
+    # Another version of a simulator may well compute something else.
+    (surroundings if any("versions." in one for one in surroundings) else settings).extend(
+        f"env: {one}" for one in other
+    )
     if settings:
         shown = "; ".join(settings[:8]) + (f"; and {len(settings) - 8} more" * (len(settings) > 8))
         raise SettingError(
@@ -180,7 +214,9 @@ def _differences(before: Any, now: Any, name: str = "") -> list[str]:
     return [] if before == now else [f"{name} was {before!r}, is {now!r}"]
 
 
-def _numbered(stages: Path, stage: str) -> list[Path]:
+def _numbered(path: Path, round_: int, stage: str) -> list[Path]:
     """Return the folders of a stage, the newest first."""
-    found = [folder for folder in stages.glob(f"{stage}-*") if folder.name[-1].isdigit()]
-    return sorted(found, key=lambda folder: -int(folder.name.rpartition("-")[2]))
+    place, name = inside(path, f"{CHECKPOINTS}/{round_}"), re.compile(rf"{stage}-([0-9]{{1,18}})")
+    found = [(name.fullmatch(folder.name), folder.name) for folder in place.glob(f"{stage}-*")]
+    numbers = [(int(match[1]), text) for match, text in found if match]
+    return [inside(place, text) for _, text in sorted(numbers, reverse=True)]

@@ -16,7 +16,7 @@ from fdtasil.experts.gate import GATE_STATES
 from fdtasil.experts.load import ExpertLike, load_expert, open_expert, sized
 from fdtasil.probes.source import Probes
 from fdtasil.progress import Progress
-from fdtasil.results.distilled import Distilled
+from fdtasil.results.distilled import Distilled, write_run
 from fdtasil.results.evaluation import Evaluation, evaluate_pair
 from fdtasil.rollouts.environments import EnvironmentLike, EnvironmentPool, resolve_horizon
 from fdtasil.rollouts.episodes import Episodes
@@ -104,10 +104,12 @@ def distill(
         max_queries: Refuse to start a run that may ask the expert more often.
         device: Where the student is trained: "cpu", "cuda", "cuda:N".
         force: Go on with a warning where the expert fails the gate but answers.
-        out: Folder of the run: checkpoints while it goes on, then all its files.
+        out: Folder of the run: checkpoints while it goes on, then all its files. It is missing,
+            empty, or a run's; a finished run in it is replaced.
         resume: Folder of a run that was interrupted; it goes on from its last checkpoint and ends
-            with the bytes of a run that never was. `max_queries` may be another; so may versions
-            and `device`, with a warning that bytes may differ.
+            with the bytes of a run that never was. `max_queries` may be another, and the expert's
+            file may lie elsewhere; so may versions and `device`, with a warning that bytes may
+            differ.
         callback: Told of each 100 training steps, each round and the evaluation; see `Event`. One
             or several, such as `fdtasil.Log("runs/walker/log", "csv")`.
         progress: Show progress bars, where there is a terminal.
@@ -120,7 +122,7 @@ def distill(
         ExpertError: If the expert can't be opened or fails the gate, before anything is trained.
         EnvironmentFault: If the environment can't be used, or misbehaves.
         FitError: If training diverges, or the GPU has no memory left.
-        StorageError: If the run's folder can't be written.
+        StorageError: If the run's folder can't be written, or holds something else.
 
     Example:
         >>> import numpy as np
@@ -166,7 +168,7 @@ def distill(
             rounds = Rounds(run, student_obs, _collecting(run, subject, bars), training)
             result = _complete(rounds, subject, given, torch_device, force=force)
             if folder:
-                result.save(folder)
+                write_run(result, folder)
                 kept.close()
     return result
 
@@ -231,7 +233,8 @@ def _folder_of(out: str | Path | None, resume: str | Path | None) -> Path | None
         found = f"out={str(out)!r} beside resume={str(resume)!r}"
         raise SettingError(found, "one folder", "leave out= out: a resumed run stays in its own")
     path = out if resume is None else resume
-    return None if path is None else Path(path)
+    # Absolute from the beginning: an environment may change the working folder.
+    return None if path is None else Path(path).absolute()
 
 
 def _collecting(run: Configuration, subject: Subject, bars: Progress) -> Collecting | None:

@@ -1,17 +1,22 @@
 """`fdtasil distill`: a run from a shell, with a baseline beside it, and gone on with."""
 
-import json
+import inspect
 import sys
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from fdtasil.errors import SettingError
+from fdtasil.errors import SettingError, StorageError, shown
 from fdtasil.experts.expert import rows_text
 from fdtasil.experts.load import load_expert
+from fdtasil.files.border import reads
 from fdtasil.files.lock import locked
-from fdtasil.files.storage import is_written, to_json, write_bytes
+from fdtasil.files.names import inside
+from fdtasil.files.plain import as_kind
+from fdtasil.files.reading import read_plain
+from fdtasil.files.run_format import CHECKPOINTS, COMMAND, check_free, stamped, unstamped
+from fdtasil.files.storage import is_written, remove_file, remove_if_empty, write_bytes
 from fdtasil.results.distilled import Distilled
 from fdtasil.results.evaluation import Evaluation, interval_text, score_text
 from fdtasil.run.pipeline import distill
@@ -30,8 +35,8 @@ from fdtasil.student.fit import Fit
 
 __all__ = ["command"]
 
-_FILE = "command.json"
-"""File of a run's folder with the arguments that `fdtasil distill` was called with."""
+_LIMIT = 2**20  # bytes of the file with the arguments that `fdtasil distill` was called with
+_NOT_STORED = ("out", "resume", "device", "baseline")
 _BESIDE = ("resume", "max_queries", "device", "baseline")  # may be said of a run that goes on
 
 
@@ -46,40 +51,42 @@ def _distill(baseline: bool, **arguments: Any) -> None:
         mine = {name: value for name, value in mine.items() if value is not None}
         arguments = {**_remembered(resume), **mine}
     out = arguments["out"] if resume is None else resume
+    # Absolute from the beginning: an environment may change the working folder.
+    folder = out.absolute()
+    place = {"out": folder} if resume is None else {"out": None, "resume": folder}
     plainly = {**arguments, "probes": 0, "out": None, "resume": None, "log_formats": ()}
     with evaluated_beside(plainly if baseline else None) as cloning:
         if resume is None:
-            with _remembering(arguments):
-                result = distil(arguments)
+            with _remembering(arguments, folder):
+                result = distil({**arguments, **place})
         else:
-            result = distil({**arguments, "out": None})  # it stays in its own folder
+            result = distil({**arguments, **place})  # it stays in its own folder
         print(_side_by_side(result, cloning()))
     print(f"queries: {rows_text(result.queries)}")
     print(f"saved in {out}: student.onnx, student.safetensors, report.json, figures/, ...")
 
 
 @contextmanager
-def _remembering(arguments: dict[str, Any]) -> Iterator[None]:
+def _remembering(arguments: dict[str, Any], folder: Path) -> Iterator[None]:
     """Keep the arguments of a run beside it, for `--resume`; not those of one that never began."""
-    folder: Path = arguments["out"]
-    if (folder / "checkpoints").exists():  # of another run, which is refused in a moment
+    check_free(folder)
+    checkpoints, path = inside(folder, CHECKPOINTS), inside(folder, COMMAND)
+    if checkpoints.exists():  # of another run, which is refused in a moment
         yield
         return
     if is_written(folder):
-        print(f"{folder} holds a finished run, which this one replaces", file=sys.stderr)
+        print(f"{arguments['out']} holds a finished run, which this one replaces", file=sys.stderr)
     plain = {k: str(v) if isinstance(v, Path) else v for k, v in arguments.items()}
-    path = folder / _FILE
     with locked(folder):  # another run's arguments stay its own
-        before = path.read_bytes() if path.exists() else None
-        write_bytes(path, to_json(plain))
+        before = read_plain(path, _LIMIT, follow=False) if path.exists() else None
+        write_bytes(path, stamped(plain))
     try:
         yield
     except BaseException:
-        if not (folder / "checkpoints").exists():
+        if not checkpoints.exists():
             if before is None:
-                path.unlink(missing_ok=True)
-                with suppress(OSError):  # only an empty folder goes
-                    folder.rmdir()
+                remove_file(path)
+                remove_if_empty(folder)
             else:
                 write_bytes(path, before)
         raise
@@ -108,28 +115,45 @@ def _remembered(folder: Path) -> dict[str, Any]:
         SettingError: If there are none, or the environment would import a module that only a
             file names.
     """
+    again = f"repeat the arguments: fdtasil distill EXPERT ENV ... --resume {folder}"
     try:
-        arguments = json.loads((folder / _FILE).read_bytes())
+        path = inside(folder, COMMAND)
+        arguments = unstamped(read_plain(path, _LIMIT, follow=False), path, older=True)
+    except StorageError:
+        raise
     except (OSError, ValueError) as error:
         raise SettingError(
-            f"{folder / _FILE} can't be read ({type(error).__name__})",
+            f"{folder / COMMAND} can't be read ({type(error).__name__})",
             "a folder that `fdtasil distill --out` has begun",
-            f"repeat the arguments: fdtasil distill EXPERT ENV ... --resume {folder}",
+            again,
         ) from error
+    read = reads(f"arguments in {folder / COMMAND}", "those of `fdtasil distill`", again)
+    arguments = read(_as_given)(arguments)
     if ":" in (arguments["env"] or ""):
         raise SettingError(
-            f"{folder / _FILE} names the environment {arguments['env']!r}",
+            f"{folder / COMMAND} names the environment {shown(arguments['env'])!r}",
             "an id without a module: importing one runs code, and a file may not ask for that",
-            f"repeat the arguments: fdtasil distill EXPERT ENV ... --resume {folder}",
+            again,
         )
     if arguments["trust"] is not None:
         raise SettingError(
-            f"{folder / _FILE} says trust={arguments['trust']!r}",
+            f"{folder / COMMAND} says trust={shown(arguments['trust'])!r}",
             "trust from the caller, never from a file",
-            f"repeat the arguments: fdtasil distill EXPERT ENV ... --resume {folder}",
+            again,
         )
-    tuples = {name: tuple(v) for name, v in arguments.items() if isinstance(v, list)}
-    return {**arguments, **tuples}
+    return arguments
+
+
+def _as_given(stored: dict[str, Any]) -> dict[str, Any]:
+    """Return stored arguments as the command takes them."""
+    known = inspect.signature(command).parameters
+    given = {name: one.default for name, one in known.items() if name not in _NOT_STORED}
+    for name, value in stored.items():
+        if name not in known:
+            raise TypeError(f"no argument {shown(name)}")
+        if name not in ("out", "resume"):  # of a folder that may have been moved since
+            given[name] = as_kind(known[name].annotation, value, name)
+    return given
 
 
 def _side_by_side(result: Distilled, cloning: Evaluation | None) -> str:

@@ -46,6 +46,8 @@ def command(
         picture: PNG file to draw the ladder of radii into.
     """
     check_count("episodes", episodes)
+    # Absolute from the beginning: an environment may change the working folder.
+    file = None if picture is None else picture.absolute()
     import_module_of(env)
     source = opened(expert, env, output=output, trust=trust)
     assert source is not None
@@ -62,8 +64,8 @@ def command(
         ]
     rows += _returns(looked)
     print("\n".join(f"{name:20}{value}" for name, value in rows))
-    if picture is not None and found is not None:
-        write_bytes(picture, draw_calibration(found))
+    if file is not None and found is not None:
+        write_bytes(file, draw_calibration(found))
         print(f"{'picture':20}{picture}")
     if problem:
         raise problem

@@ -1,15 +1,18 @@
 """Where a training stands: what it needs to go on with the same bytes."""
 
 import math
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor, nn
 
-from fdtasil.errors import FitError, StorageError, first_line
+from fdtasil.errors import FitError
+from fdtasil.files.border import reads
+from fdtasil.files.plain import from_plain
 from fdtasil.files.tensors import tensors_from_bytes, tensors_to_bytes
 from fdtasil.student.loss import TaylorLoss
 
-__all__ = ["FitState"]
+__all__ = ["FitState", "check_history"]
 
 _ENTRY = "fit"
 
@@ -127,6 +130,11 @@ class FitState:
         }
         return tensors_to_bytes(tensors, numbers, _ENTRY)
 
+    @reads(
+        "the state of this training",
+        "a checkpoint of the same run",
+        "start the run anew in another folder",
+    )
     def restore(self, data: bytes) -> None:
         """Take over the state that `to_bytes` wrote.
 
@@ -134,29 +142,58 @@ class FitState:
             StorageError: If it is not such a state, or of another student.
         """
         tensors, numbers = tensors_from_bytes(data, _ENTRY, "the state of a training")
-        try:
-            self._student.load_state_dict(_group(tensors, "student"))
-            self._load_moments(tensors)
-        except (KeyError, ValueError, RuntimeError) as error:
-            raise StorageError(
-                f"not the state of this training: {first_line(error)}",
-                "a checkpoint of the same run",
-                "start the run anew in another folder",
-            ) from error
-        self.step, self.stale = numbers["step"], numbers["stale"]
-        self.history = numbers["history"]
-        best = numbers["best_loss"]
-        self._best_loss = math.inf if best is None else best
-        device = next(self._student.parameters()).device
-        self._best = {k: v.to(device) for k, v in _group(tensors, "best").items()}
+        whole = from_plain(_Numbers, numbers)
+        check_history(list(whole.history))
+        self._student.load_state_dict(_group(tensors, "student"))
+        self._load_moments(tensors)
+        self.step, self.stale, self.history = whole.step, whole.stale, list(whole.history)
+        self._best_loss = math.inf if whole.best_loss is None else whole.best_loss
+        device, shapes = next(self._student.parameters()).device, self._student.state_dict()
+        best = _group(tensors, "best")
+        if best and {k: v.shape for k, v in best.items()} != {
+            k: v.shape for k, v in shapes.items()
+        }:
+            raise ValueError("best weights of another student")
+        self._best = {k: v.to(device) for k, v in best.items()}
         recent = _group(tensors, "recent").get("losses")
+        if recent is not None and (recent.ndim, recent.shape[-1]) != (2, len(TaylorLoss._fields)):
+            raise ValueError(f"losses of shape {tuple(recent.shape)}")
         self._recent = [] if recent is None else list(recent.to(device))
 
     def _load_moments(self, tensors: dict[str, Tensor]) -> None:
         whole = self._optimiser.state_dict()
         numbers = whole["param_groups"][0]["params"]
+        weights = list(self._student.parameters())
         whole["state"] = {number: _group(tensors, f"optimiser.{number}") for number in numbers}
+        for number, moments in whole["state"].items():  # a fused step would read beyond others
+            shapes = {name: moment.shape for name, moment in moments.items()}
+            like = weights[number].shape
+            if shapes != {"step": torch.Size(), "exp_avg": like, "exp_avg_sq": like}:
+                raise ValueError(f"moments of shapes {shapes}")
         self._optimiser.load_state_dict(whole)
+
+
+@dataclass(frozen=True)
+class _Numbers:
+    """What a state says beside its tensors; see `FitState`."""
+
+    step: int
+    stale: int
+    best_loss: float | None
+    history: tuple[dict, ...]
+
+
+def check_history(history: object) -> None:
+    """Refuse what is no list of entries of numbers by name.
+
+    Raises:
+        TypeError: If it is none.
+    """
+    entries = history if isinstance(history, list) else [None]
+    for entry in entries:
+        numbers = entry.values() if isinstance(entry, dict) else [None]
+        if not all(type(number) in (int, float) for number in numbers):
+            raise TypeError("a history that is none")
 
 
 def _group(tensors: dict[str, Tensor], name: str) -> dict[str, Tensor]:

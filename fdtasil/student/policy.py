@@ -1,13 +1,16 @@
 """The policy that is kept: normalise, network, action bounds; its own file."""
 
 from collections.abc import Mapping
+from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor, nn
 
 from fdtasil.compute import ask_module
-from fdtasil.errors import SettingError, StorageError, first_line
+from fdtasil.errors import SettingError
+from fdtasil.files.border import reads
 from fdtasil.files.onnx.graph import Graph
 from fdtasil.files.tensors import tensors_from_bytes, tensors_to_bytes
 from fdtasil.probes.scales import Scales
@@ -151,6 +154,11 @@ class Student(nn.Module):
         return tensors_to_bytes(self.state_dict(), about, _ENTRY)
 
     @classmethod
+    @reads(
+        "a student's weights",
+        "a student.safetensors written by fdtasil",
+        "check the path, or save again",
+    )
     def from_bytes(cls, data: bytes) -> "Student":
         """Read what `to_bytes` wrote.
 
@@ -158,18 +166,34 @@ class Student(nn.Module):
             StorageError: If it is not a student's file.
         """
         tensors, about = tensors_from_bytes(data, _ENTRY, "a student's weights")
-        try:
-            fields = {k: v for k, v in about["student"].items() if not k.endswith("_size")}
-            mean, scale, low, high = (
-                tensors[name].numpy() for name in ("mean", "scale", "low", "high")
-            )
-            architecture, random = architecture_of(fields), torch.Generator()
-            student = cls(architecture, mean, scale, low, high, random)
-            student.load_state_dict(tensors)
-        except (KeyError, TypeError, ValueError, RuntimeError) as error:
-            raise StorageError(
-                f"not a student's weights: {type(error).__name__} {first_line(error)}",
-                "a student.safetensors written by fdtasil",
-                "check the path, or save again",
-            ) from error
+        fields = {k: v for k, v in about["student"].items() if not k.endswith("_size")}
+        mean, scale, low, high = (
+            tensors[name].numpy() for name in ("mean", "scale", "low", "high")
+        )
+        if any(vector.ndim != 1 for vector in (mean, scale, low, high)):
+            raise ValueError("a normaliser or bounds that are no vectors")
+        _check_widths(fields, tensors, len(mean), len(low))
+        architecture, random = architecture_of(fields), torch.Generator()
+        student = cls(architecture, mean, scale, low, high, random)
+        student.load_state_dict(tensors)
         return student.eval()
+
+
+def _check_widths(
+    fields: Mapping[str, Any], tensors: Mapping[str, Tensor], inputs: int, outputs: int
+) -> None:
+    """Refuse a network far larger than its weights, before memory is taken for it."""
+    shapes = [tensor.shape for tensor in tensors.values()]
+    most = max((len(tensors), *(size for shape in shapes for size in shape)))
+    for name, value in fields.items():
+        numbers = value if isinstance(value, list) else [value]
+        if len(numbers) > len(tensors):
+            raise ValueError(f"{name} has {len(numbers):,} entries")
+        if any(isinstance(number, (int, float)) and number > most for number in numbers):
+            raise ValueError(f"{name} is larger than any of the weights")
+    widths = fields.get("hidden")
+    if isinstance(widths, list):
+        known = {tuple(shape) for shape in shapes}
+        layers = pairwise((inputs, *widths, outputs))
+        if any((after, before) not in known for before, after in layers):
+            raise ValueError("hidden is not what the weights are")

@@ -1,6 +1,7 @@
 """What the student sees of what the expert sees."""
 
 import operator
+import pickle
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
@@ -11,12 +12,49 @@ from fdtasil.errors import SettingError
 from fdtasil.probes.answers import Answers
 from fdtasil.rollouts.behaviours import Policy
 
-__all__ = ["StudentObservation", "View", "describe_view"]
+__all__ = ["StudentObservation", "Unseen", "View", "describe_view"]
 
 StudentObservation = Sequence[int] | Callable[[np.ndarray], np.ndarray]
 """Indices of the coordinates that the student sees, or (B, n) -> (B, k)."""
 
 _SAME = 1e-4  # relative; beyond the rounding of float32, below any nonlinearity worth the name
+
+
+def _whole(rows: np.ndarray) -> np.ndarray:
+    return rows
+
+
+@dataclass(frozen=True)
+class _Columns:
+    """(B, n) -> (B, k), a choice of coordinates."""
+
+    indices: tuple[int, ...]
+
+    def __call__(self, rows: np.ndarray) -> np.ndarray:
+        return rows[:, list(self.indices)]
+
+
+@dataclass(frozen=True)
+class Unseen:
+    """Stands for a function of the user that no file or pickle holds.
+
+    Attributes:
+        name: What the function is called.
+    """
+
+    name: str
+
+    def __call__(self, rows: np.ndarray) -> np.ndarray:
+        """Refuse to look.
+
+        Raises:
+            SettingError: Always.
+        """
+        raise SettingError(
+            f"the student sees through {self.name}, which no file can hold",
+            "the function itself",
+            "pass it: Distilled.load(folder, student_obs=...)",
+        )
 
 
 @dataclass(frozen=True)
@@ -49,14 +87,23 @@ class View:
         """
         n = states.shape[1]
         if student_obs is None:
-            return View(lambda rows: rows, None, n, np.ones(n, bool))
+            return View(_whole, None, n, np.ones(n, bool))
         if callable(student_obs):
             return _from_function(student_obs, states)
         columns = _indices(student_obs)
         if not columns or not all(0 <= index < n for index in columns):
             raise _not_indices(student_obs, f"indices from 0 to {n - 1}, at least one")
         seen = np.isin(np.arange(n), columns)
-        return View(lambda rows: rows[:, list(columns)], columns, len(columns), seen)
+        return View(_Columns(columns), columns, len(columns), seen)
+
+    def __reduce__(self) -> tuple[object, ...]:
+        """Leave out a function that can't be pickled, such as a lambda: the rest is not lost."""
+        look = self.look
+        try:
+            pickle.dumps(look)
+        except Exception:  # functions of users raise anything
+            look = Unseen(str(describe_view(look)))
+        return View, (look, self.columns, self.size, self.seen)
 
     def policy(self, student: Policy) -> Policy:
         """Return the student as a policy on whole observations."""

@@ -5,6 +5,7 @@ huggingface_hub is imported inside the functions: it is an extra, and `import fd
 
 import hashlib
 import os
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path, PurePosixPath
 from typing import TYPE_CHECKING
@@ -13,8 +14,10 @@ from fdtasil.errors import ExpertError, first_line
 from fdtasil.experts.hub.requests import download, look_up, no_file
 from fdtasil.experts.hub.uri import COMMIT, HubUri, is_hub_uri, parse
 from fdtasil.experts.sb3.statistics import statistics_beside
+from fdtasil.files.names import stays_inside
 from fdtasil.files.onnx.model import side_files
-from fdtasil.files.storage import sha256, stays_inside, write_bytes
+from fdtasil.files.reading import FILE_LIMIT, read_limited
+from fdtasil.files.storage import sha256, write_bytes
 
 if TYPE_CHECKING:
     from huggingface_hub.hf_api import RepoSibling
@@ -86,7 +89,11 @@ def _declared(path: Path) -> list[str]:
     """
     if path.suffix == ".zip":
         return []
-    return sorted(name for name in side_files(path.read_bytes()) if stays_inside(name))
+    return sorted(
+        name
+        for name in side_files(read_limited(path, FILE_LIMIT, "a file of the hub"))
+        if stays_inside(name)
+    )
 
 
 def _stored(uri: HubUri) -> Path:
@@ -102,8 +109,9 @@ def _stored(uri: HubUri) -> Path:
         if files and uri.file not in files:
             raise no_file(uri, sorted(files))
         _check_statistics(uri, files)
+        check = _hash_of(uri, files.get(uri.file))
         data = download(uri)
-        _check_whole(uri, data, files.get(uri.file))
+        check(data)
         write_bytes(path, data)
     return path
 
@@ -135,18 +143,33 @@ def _check_statistics(uri: HubUri, files: "dict[str, RepoSibling]") -> None:
         )
 
 
-def _check_whole(uri: HubUri, data: bytes, described: "RepoSibling | None") -> None:
-    """Refuse what a proxy or a broken connection made of a file: it would be kept for ever."""
-    expected, found = None, None
-    if described is not None and described.lfs is not None:
-        expected, found = described.lfs.sha256, sha256(data)
-    elif described is not None:
-        blob = b"blob %d\0" % len(data) + data  # how git names the content of a file
-        expected = described.blob_id
-        found = hashlib.sha1(blob, usedforsecurity=False).hexdigest()
-    if expected is not None and expected != found:
+def _hash_of(uri: HubUri, described: "RepoSibling | None") -> Callable[[bytes], None]:
+    """Return what refuses bytes that are not the file's: they would be kept for ever.
+
+    A proxy or a broken connection makes others of them; so does a mirror that names no hash.
+    """
+    if described is not None and described.lfs is not None and described.lfs.sha256:
+        expected, hashed = described.lfs.sha256, sha256
+    elif described is not None and described.lfs is None and described.blob_id:
+        expected, hashed = described.blob_id, _git_name
+    else:
         raise ExpertError(
-            f"{uri} arrived with {len(data):,} bytes and the hash {found}",
-            f"the hash {expected} that the hub names",
-            "try again; if it stays so, something between here and the hub changes files",
+            f"the list of files of {uri.repo} has no hash of {uri.file}",
+            "a hub that names the hash of each file",
+            "unset HF_ENDPOINT; or download the file, look at it, and name its path",
         )
+
+    def check(data: bytes) -> None:
+        if hashed(data) != expected:
+            raise ExpertError(
+                f"{uri} arrived with {len(data):,} bytes and the hash {hashed(data)}",
+                f"the hash {expected} that the hub names",
+                "try again; if it stays so, something between here and the hub changes files",
+            )
+
+    return check
+
+
+def _git_name(data: bytes) -> str:
+    """Return how git names the content of a file."""
+    return hashlib.sha1(b"blob %d\0" % len(data) + data, usedforsecurity=False).hexdigest()

@@ -6,7 +6,7 @@ from pathlib import Path, PurePosixPath
 from typing import TypeGuard
 
 from fdtasil.errors import ExpertError
-from fdtasil.files.storage import stays_inside
+from fdtasil.files.names import stays_inside
 
 __all__ = ["COMMIT", "HubUri", "is_hub_uri", "malformed", "parse"]
 
@@ -49,7 +49,7 @@ def parse(text: str) -> HubUri:
         ExpertError: If it names no file of a model repository.
     """
     found = _URI.fullmatch(text)
-    if not found or not stays_inside(found["file"]):
+    if not found or not all(stays_inside(found[part]) for part in ("repo", "file")):
         raise malformed(text)
     return HubUri(found["repo"], str(PurePosixPath(found["file"])), found["revision"])
 

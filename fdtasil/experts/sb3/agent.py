@@ -7,13 +7,14 @@ import numpy as np
 from numpy.typing import ArrayLike
 from torch import nn
 
-from fdtasil.errors import ExpertError, SettingError
+from fdtasil.errors import ExpertError, FdtasilError, SettingError
 from fdtasil.experts.sb3.archive import Archive, read_archive
 from fdtasil.experts.sb3.network import Clip, Normalise, Rescale, build_network
 from fdtasil.experts.sb3.recipes import Recipe, check_policy, find_recipe, read_activation
 from fdtasil.experts.sb3.spaces import Bounds, given_bounds, read_bounds, read_size
 from fdtasil.experts.sb3.statistics import VecNormalizePath, read_statistics
 from fdtasil.experts.sb3.trust import TRUST, Trust, check_trust
+from fdtasil.files.border import reads
 
 __all__ = ["Agent", "read_agent"]
 
@@ -46,6 +47,13 @@ class Agent:
     statistics_sha256: str | None
 
 
+@reads(
+    "an agent that can be read",
+    "a zip written by save() of stable-baselines3",
+    'save the agent again, or write trust="pickle" if you trust the file',
+    ExpertError,
+    passes=FdtasilError,
+)
 def read_agent(
     path: str | Path,
     *,

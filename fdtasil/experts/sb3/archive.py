@@ -1,7 +1,6 @@
 """The zip of an agent: its record as JSON and its weights, within limits, without unpickling."""
 
 import io
-import json
 import re
 import zipfile
 from dataclasses import dataclass
@@ -12,7 +11,8 @@ import torch
 from torch import Tensor
 
 from fdtasil.errors import ExpertError, first_line
-from fdtasil.files.reading import read_limited
+from fdtasil.files.border import reads
+from fdtasil.files.reading import from_json, read_limited
 from fdtasil.files.storage import sha256
 
 __all__ = ["Archive", "read_archive", "read_file"]
@@ -21,6 +21,11 @@ _FILE_LIMIT = 256 * 2**20
 # A few kilobytes of zip can unpack to gigabytes, so the sizes are looked at before unpacking.
 _MEMBER_LIMITS = {"data": 16 * 2**20, "policy.pth": _FILE_LIMIT, "_stable_baselines3_version": 64}
 _AGAIN = "copy or download the file again"
+_ZIP = "an agent", "a zip written by save() of stable-baselines3", _AGAIN, ExpertError
+_TYPES = (
+    *(torch.float16, torch.bfloat16, torch.float32, torch.float64),
+    *(torch.int32, torch.int64, torch.uint8, torch.bool),
+)
 
 
 @dataclass(frozen=True)
@@ -50,6 +55,7 @@ class Archive:
             return "unknown"
         return text if re.fullmatch(r"[\w.+-]+", text) else "unknown"
 
+    @reads(*_ZIP)
     def weights(self) -> dict[str, Tensor]:
         """Read `policy.pth` by name.
 
@@ -67,7 +73,7 @@ class Archive:
                 _AGAIN,
             ) from error
         if not isinstance(weights, dict) or not all(
-            isinstance(name, str) and isinstance(tensor, Tensor)
+            isinstance(name, str) and isinstance(tensor, Tensor) and _is_plain(tensor)
             for name, tensor in weights.items()
         ):
             raise ExpertError(
@@ -76,6 +82,15 @@ class Archive:
         return weights
 
 
+def _is_plain(tensor: Tensor) -> bool:
+    """Whether a tensor has numbers, of a usual type, and no more of them than the file has."""
+    dense = tensor.device.type == "cpu" and tensor.layout == torch.strided
+    if not dense or tensor.dtype not in _TYPES:
+        return False
+    return tensor.numel() * tensor.element_size() <= tensor.untyped_storage().nbytes()
+
+
+@reads(*_ZIP)
 def read_archive(path: Path) -> Archive:
     """Read the zip of an agent.
 
@@ -85,8 +100,8 @@ def read_archive(path: Path) -> Archive:
     content = read_file(path)
     data = _member(path, content, "data")
     try:
-        record = json.loads(data)
-    except (ValueError, RecursionError) as error:
+        record = from_json(data)
+    except ValueError as error:
         raise ExpertError(
             f"{path}: the member data is no JSON: {first_line(error)}",
             "the JSON that stable-baselines3 writes",
