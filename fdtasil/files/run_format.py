@@ -43,7 +43,8 @@ def unstamped(data: bytes, source: object, *, older: bool = False) -> dict[str, 
     if not isinstance(values, dict):
         raise ValueError("no JSON object")
     number = values.get("format")
-    if number != FORMAT and not (older and number is None):
+    known = type(number) is int and number == FORMAT
+    if not known and not (older and number is None):
         raise _another_format(number, values, source)
     return {name: value for name, value in values.items() if name not in _STAMP}
 

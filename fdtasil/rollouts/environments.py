@@ -131,9 +131,13 @@ class EnvironmentPool:
         self._single = True
 
     def close(self) -> None:
-        """Close the copies that the pool made."""
+        """Close the copies that the pool made; what can't be closed is warned of."""
         for member in [*self._members, *self._kept] if self._owned else []:
-            member.close()
+            try:
+                member.close()
+            except Exception as error:  # of the user's; what was done in it is not lost for that
+                kind = type(error).__name__
+                warn(f"{self.name} can't be closed: {kind}: {first_line(error)}")
 
     def __enter__(self) -> "EnvironmentPool":
         return self
