@@ -1,8 +1,6 @@
 """Whatever answers observations with actions: a table of kinds, and the choice between them."""
 
-import copy
 import dataclasses
-import inspect
 import warnings
 from collections import Counter
 from collections.abc import Callable
@@ -15,14 +13,18 @@ import numpy as np
 import torch
 
 from fdtasil.checks import check_count
-from fdtasil.compute import ask_module, usual_modes
+from fdtasil.compute import usual_modes
 from fdtasil.errors import ExpertError, FdtasilWarning, SettingError
 from fdtasil.experts.expert import CHUNK, Expert, Hints
 from fdtasil.experts.http_expert import is_http_url, open_http
 from fdtasil.experts.hub import fetch, is_hub_uri
+from fdtasil.experts.modules import ask_as_it_is, open_module
 from fdtasil.experts.onnx_expert import open_onnx
+from fdtasil.experts.predicting import open_predictor
 from fdtasil.experts.sb3.agent import read_agent
 from fdtasil.experts.sb3.trust import Trust
+from fdtasil.experts.sizes import size_hint
+from fdtasil.experts.trial import vouch_for
 from fdtasil.experts.workers import BATCH, check_workers, with_processes, with_threads
 from fdtasil.rollouts.behaviours import Policy
 
@@ -113,11 +115,12 @@ def sized(expert: Expert, observation_size: int | None, action_size: int | None)
     said = (expert.observation_size, expert.action_size)
     expected = (observation_size, action_size)
     for role, ours, theirs in zip(("observations", "actions"), said, expected, strict=True):
-        if None not in (ours, theirs) and ours != theirs:
+        if ours is not None and theirs is not None and ours != theirs:
+            step = "check the environment's version and options, and the output that was chosen"
             raise ExpertError(
                 f"{expert.name} has {ours} {role}, the environment has {theirs}",
                 "an expert of this environment",
-                "check the environment's version and options, and the output that was chosen",
+                size_hint(ours, theirs) if role == "observations" else step,
             )
     return dataclasses.replace(
         expert, observation_size=said[0] or expected[0], action_size=said[1] or expected[1]
@@ -148,6 +151,7 @@ def _opener(source: ExpertLike, expert: Expert, hints: Hints) -> Callable[[], Po
 
 
 def _open_again(file: str | Path, hints: Hints, sha256: str | None) -> Policy:
+    vouch_for(sha256)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FdtasilWarning)  # the caller has been told
         expert = open_expert(file, hints)
@@ -182,7 +186,7 @@ def _from_hub(uri: str | Path, hints: Hints) -> Expert:
 def _from_agent(path: str | Path, hints: Hints) -> Expert:
     agent = read_agent(path, trust=hints.trust)
     return dataclasses.replace(
-        _from_module(agent.module),
+        ask_as_it_is(agent.module),
         name=Path(path).name,
         observation_size=agent.observation_size,
         action_size=len(agent.action_low),
@@ -194,8 +198,8 @@ def _from_agent(path: str | Path, hints: Hints) -> Expert:
 def _from_torch(module: torch.nn.Module, hints: Hints) -> Expert:
     """Ask a module by calling it, unless it has a `predict` that answers otherwise."""
     if not isinstance(module, Predictor) or _is_the_policy(module, hints.observation_size):
-        return _from_module(module)
-    return _from_predict(module)
+        return open_module(module)
+    return open_predictor(module)
 
 
 def _is_the_policy(module: torch.nn.Module, observation_size: int | None) -> bool:
@@ -204,38 +208,15 @@ def _is_the_policy(module: torch.nn.Module, observation_size: int | None) -> boo
         return False
     rows = np.random.default_rng(0).standard_normal((8, observation_size)).astype(np.float32)
     try:
-        called, asked = _from_module(module).answer(rows), _from_predict(module).answer(rows)
+        called = open_module(module).answer(rows.copy())
+        asked = open_predictor(module).answer(rows.copy())
     except (AttributeError, RuntimeError, TypeError, ValueError):
         return False
     return np.shape(called) == np.shape(asked) and np.allclose(called, asked, atol=1e-5)
 
 
-def _from_module(given: torch.nn.Module) -> Expert:
-    module = copy.deepcopy(given).eval()  # the caller's may go on training
-    answer = partial(ask_module, module)
-    return Expert(answer, f"the torch module {type(module).__name__}", module=module)
-
-
-def _from_predict(source: Any, hints: Hints | None = None) -> Expert:
-    name = f"{type(source).__name__}.predict"
-    # scikit-learn's predict takes the batch alone; stable-baselines3's is stochastic by default.
-    parameters = inspect.signature(source.predict).parameters
-    options = {"deterministic": True} if "deterministic" in parameters else {}
-
-    def answer(observations: np.ndarray) -> np.ndarray:
-        result = source.predict(observations, **options)
-        if not isinstance(result, tuple):
-            return result
-        actions, state = result
-        if state is not None:
-            raise ExpertError(
-                f"{name} returns a state beside its actions",
-                "a policy without memory",
-                "distil a policy that depends on the observation only",
-            )
-        return actions
-
-    return Expert(answer, name)
+def _from_predictor(source: Predictor, hints: Hints) -> Expert:
+    return open_predictor(source)
 
 
 def _from_function(function: Callable[[np.ndarray], np.ndarray], hints: Hints) -> Expert:
@@ -273,7 +254,7 @@ KINDS = (
     Kind(_is_zip, _from_agent),
     Kind(_is_path, open_onnx),
     Kind(lambda source: isinstance(source, torch.nn.Module), _from_torch),
-    Kind(lambda source: isinstance(source, Predictor), _from_predict),
+    Kind(lambda source: isinstance(source, Predictor), _from_predictor),
     Kind(callable, _from_function),
 )
 """Every kind of expert; the first that recognises a source opens it."""

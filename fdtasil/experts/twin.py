@@ -67,13 +67,15 @@ class _Twin(torch.nn.Module):
         self._input, self._output = graph.input[0].name, output
         self._nodes = [
             (
-                OPERATORS[node.op_type],
+                node.op_type,  # and not its function: a twin may be sent to another process
                 list(node.input),
                 node.output[0],
                 {a.name: onnx.helper.get_attribute_value(a) for a in node.attribute},
             )
             for node in _needed(graph, output)
         ]
+        if unknown := {operator for operator, *_ in self._nodes} - OPERATORS.keys():
+            raise ValueError(f"{unknown} are no operators of an MLP")
 
     def forward(self, observations: Tensor) -> Tensor:
         """(B, n) float32 -> (B, m) float32."""
@@ -85,7 +87,7 @@ class _Twin(torch.nn.Module):
         for name, constant in self._constants.items():
             values[name] = constant.to(observations.device)
         for operator, inputs, output, attributes in self._nodes:
-            values[output] = operator(*(values[name] for name in inputs), **attributes)
+            values[output] = OPERATORS[operator](*(values[name] for name in inputs), **attributes)
             if largest is not None and values[output].numel() > largest:
                 raise ValueError(f"{output} is larger than anything in an MLP")
         return values[self._output]

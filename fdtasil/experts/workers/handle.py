@@ -16,9 +16,10 @@ from fdtasil.errors import ExpertError
 from fdtasil.experts import worker_process
 from fdtasil.experts.expert import RaisedElsewhere
 
-__all__ = ["WorkerProcess"]
+__all__ = ["Ended", "WorkerProcess", "in_a_process"]
 
 _START_SECONDS = 60.0  # at least; a worker may have to import torch on a busy machine
+_LAST_SECONDS = 2.0  # between the end of a process's pipe and its own
 _ONE_THREAD = dict.fromkeys(
     (
         "OMP_NUM_THREADS",
@@ -71,15 +72,7 @@ class WorkerProcess:
                 _kill(self._process)
 
     def _start(self) -> None:
-        # A process group of its own keeps the terminal's Ctrl-C away from it from its first
-        # moment, and lets it be ended together with whatever it starts.
-        process = subprocess.Popen(
-            [sys.executable, "-P", str(Path(worker_process.__file__))],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            env=os.environ | _ONE_THREAD,
-            process_group=0,
-        )
+        process = _started(None)
         with self._lock:
             self._process = process
             if self._stopped:
@@ -127,6 +120,9 @@ class WorkerProcess:
     def _gone(
         self, process: "subprocess.Popen[bytes]", seconds: float | None, when: str
     ) -> ExpertError:
+        # A process that ends by itself closes its pipe first: a kill now would be taken for it.
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(0 if self._stopped else _LAST_SECONDS)
         self._bury()
         if self._expired:
             return ExpertError(
@@ -134,11 +130,12 @@ class WorkerProcess:
                 f"an answer within timeout={self._timeout:g}",
                 "raise timeout=, write a smaller batch=, or see what it waits for",
             )
+        memory = process.returncode == -signal.SIGKILL  # which the kernel sends
         return ExpertError(
             f"{self._title} {_ending(process.returncode)} {when}",
             "a worker that lives as long as it is asked",
-            "call it on such a batch on its own; SIGKILL is often the kernel, out of memory: "
-            "write fewer workers=",
+            "call it on such a batch on its own"
+            + ("; often the memory is full: write fewer workers=" if memory else ""),
         )
 
     def _bury(self) -> None:
@@ -152,6 +149,64 @@ class WorkerProcess:
         for stream in (process.stdin, process.stdout):
             with suppress(OSError):  # what it has not read can't be flushed any more
                 stream.close()  # pyright: ignore[reportOptionalMemberAccess]
+
+
+class Ended(Exception):
+    """A process ended, or was ended, before it had done its work."""
+
+
+def in_a_process(parcel: bytes, seconds: float) -> None:
+    """Have a process of its own do some work, and end it.
+
+    Args:
+        parcel: A pickled function without arguments.
+        seconds: After which the process is ended.
+
+    Raises:
+        Ended: If it does not live to say that it is done.
+        ExpertError: What the work refused.
+        RaisedElsewhere: What the work raised.
+    """
+    process = _started(subprocess.DEVNULL)  # a crash has its own words for standard error
+    assert process.stdin is not None
+    assert process.stdout is not None
+    clock = threading.Timer(seconds, _kill, (process,))
+    clock.start()
+    try:
+        worker_process.send(process.stdin, (sys.path, parcel))
+        outcome, value = pickle.loads(worker_process.receive(process.stdout))
+    except (OSError, EOFError) as error:
+        late = clock.finished.is_set()
+        with suppress(subprocess.TimeoutExpired):
+            process.wait(_LAST_SECONDS)
+        _kill(process)
+        how = f"took more than {seconds:g} s" if late else _ending(process.wait())
+        raise Ended(f"{how} in a process that opened it") from error
+    finally:
+        clock.cancel()
+        _kill(process)
+        process.wait()
+        for stream in (process.stdin, process.stdout):
+            with suppress(OSError):
+                stream.close()
+    if outcome == "refused":
+        raise ExpertError(*value)
+    if outcome == "raised":
+        raise RaisedElsewhere(*value[:2])
+
+
+def _started(messages: int | None) -> "subprocess.Popen[bytes]":
+    """Start a worker process, which writes its `messages` where it is told to."""
+    # A process group of its own keeps the terminal's Ctrl-C away from it from its first moment,
+    # and lets it be ended together with whatever it starts.
+    return subprocess.Popen(
+        [sys.executable, "-P", str(Path(worker_process.__file__))],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=messages,
+        env=os.environ | _ONE_THREAD,
+        process_group=0,
+    )
 
 
 def _kill(process: "subprocess.Popen[bytes]") -> None:

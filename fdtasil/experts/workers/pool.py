@@ -7,10 +7,11 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_EXCEPTION, CancelledError, ThreadPoolExecutor, wait
 from dataclasses import dataclass, field
 from queue import SimpleQueue
-from typing import Protocol
+from typing import NoReturn, Protocol
 
 import numpy as np
 
+from fdtasil.errors import ExpertError
 from fdtasil.rollouts.behaviours import Policy
 
 __all__ = ["Asker", "WorkerGroup"]
@@ -65,6 +66,13 @@ class WorkerGroup:
             call.over.set()
             for asker in tuple(call.busy):
                 asker.stop()
+
+    def __reduce__(self) -> NoReturn:
+        raise ExpertError(
+            "an expert with workers can't be sent to another process, or copied",
+            "the expert that it was made of",
+            "open it there: load_expert(..., workers=...)",
+        )
 
     def _one(self, call: "_Call", batch: np.ndarray) -> np.ndarray:
         asker = self._idle.get()

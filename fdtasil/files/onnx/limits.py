@@ -9,14 +9,24 @@ import threading
 import time
 from dataclasses import dataclass, field
 from functools import cache
+from types import ModuleType
 from typing import TYPE_CHECKING
 
 import numpy as np
 
+from fdtasil.files.onnx.runtime import runtime
+
 if TYPE_CHECKING:
     import onnxruntime
 
-__all__ = ["CALL_SECONDS", "MEMORY", "limit_memory", "run_within_limits"]
+try:
+    import resource as _module
+except ImportError:  # Windows has no such limits; time is limited there too
+    _resource: ModuleType | None = None
+else:
+    _resource = _module
+
+__all__ = ["CALL_SECONDS", "MEMORY", "limit_memory", "limit_process", "run_within_limits"]
 
 CALL_SECONDS = 60.0
 MEMORY = 4 * 2**30  # bytes, for all models of a process together
@@ -33,6 +43,20 @@ def limit_memory(options: "onnxruntime.SessionOptions") -> None:
     )
 
 
+def limit_process(more: int) -> None:
+    """Limit this process to the memory of a model and `more` bytes, where the system can.
+
+    Address space would count what onnxruntime only reserves, so what is written to is limited.
+    """
+    if _resource is None:
+        return
+    most = MEMORY + more
+    for limit, value in ((_resource.RLIMIT_DATA, most), (_resource.RLIMIT_CORE, 0)):
+        hard = _resource.getrlimit(limit)[1]
+        unlimited = hard == _resource.RLIM_INFINITY
+        _resource.setrlimit(limit, (value if unlimited else min(value, hard), hard))
+
+
 def run_within_limits(
     session: "onnxruntime.InferenceSession", output: str, feed: dict[str, np.ndarray]
 ) -> np.ndarray:
@@ -43,9 +67,7 @@ def run_within_limits(
             or between two turns of a loop; a single operator can't be interrupted.
         MemoryError: If it takes more than `MEMORY`.
     """
-    import onnxruntime
-
-    call = _Call(onnxruntime.RunOptions())
+    call = _Call(runtime().RunOptions())
     _watch(call)
     try:
         return np.asarray(session.run([output], feed, call.options)[0])
@@ -97,8 +119,7 @@ def _look() -> None:
 
 @cache
 def _register_allocator() -> None:
-    import onnxruntime
-
+    onnxruntime = runtime()
     memory = onnxruntime.OrtMemoryInfo(
         "Cpu",
         onnxruntime.OrtAllocatorType.ORT_ARENA_ALLOCATOR,

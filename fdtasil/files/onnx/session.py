@@ -7,24 +7,25 @@ import numpy as np
 
 from fdtasil.errors import ExpertError, first_line, shown
 from fdtasil.files.onnx.limits import limit_memory, run_within_limits
+from fdtasil.files.onnx.runtime import runtime
 
 if TYPE_CHECKING:
     import onnx
     import onnxruntime
 
+__all__ = ["is_batched", "open_session", "rebatched", "run_session"]
 
 # Whose operators come with onnxruntime; the others are in libraries of native code.
 _DOMAINS = ("ai.onnx", "com.microsoft")
 
 
-def open_session(model: "onnx.ModelProto", name: str) -> "onnxruntime.InferenceSession":
-    """Open a model on one CPU thread.
+def open_session(model: "onnx.ModelProto | bytes", name: str) -> "onnxruntime.InferenceSession":
+    """Open a model, or its bytes, on one CPU thread.
 
     Raises:
         ExpertError: If onnxruntime can't run it, with its reason in one line.
     """
-    import onnxruntime
-
+    onnxruntime = runtime()
     options = onnxruntime.SessionOptions()
     # One thread and no spinning: the default slows torch in the same process many times over.
     options.intra_op_num_threads = options.inter_op_num_threads = 1
@@ -35,7 +36,7 @@ def open_session(model: "onnx.ModelProto", name: str) -> "onnxruntime.InferenceS
     try:
         # Falling back to the one provider that there is prints a banner to standard output.
         return onnxruntime.InferenceSession(
-            model.SerializeToString(),
+            model if isinstance(model, bytes) else model.SerializeToString(),
             options,
             providers=["CPUExecutionProvider"],
             enable_fallback=0,
@@ -65,24 +66,24 @@ def is_batched(session: "onnxruntime.InferenceSession") -> bool:
     return not isinstance(session.get_inputs()[0].shape[0], int)
 
 
-def rebatched(model: "onnx.ModelProto") -> "onnx.ModelProto":
-    """Return a copy whose first input and output dimensions are free instead of fixed."""
+def rebatched(data: bytes) -> bytes:
+    """Return a model whose first input and output dimensions are free instead of fixed."""
     import onnx
 
-    copy = onnx.ModelProto()
-    copy.CopyFrom(model)
+    copy = onnx.load_model_from_string(data)
     for value in (*copy.graph.input, *copy.graph.output):
         if value.type.tensor_type.shape.dim:
             value.type.tensor_type.shape.dim[0].dim_param = "batch"
     del copy.graph.value_info[:]  # shapes inferred for the fixed batch
-    return copy
+    return copy.SerializeToString()
 
 
-def _cannot_run(model: "onnx.ModelProto", name: str, error: Exception) -> ExpertError:
+def _cannot_run(given: "onnx.ModelProto | bytes", name: str, error: Exception) -> ExpertError:
     """Say why onnxruntime refuses a model; its own texts begin with signatures of C++."""
-    import onnxruntime
+    import onnx
 
-    text, library = str(error), f"onnxruntime {onnxruntime.__version__}"
+    text, library = str(error), f"onnxruntime {runtime().__version__}"
+    model = onnx.load_model_from_string(given) if isinstance(given, bytes) else given
     try:
         needed = ", ".join(f"{x.domain or 'opset'} {x.version}" for x in model.opset_import)
         foreign = sorted(_foreign_operators(model))

@@ -1,0 +1,328 @@
+"""An ONNX model as a policy: which output holds the actions, and how it is asked in batches.
+
+Nothing here needs torch: the process that tries unknown files starts in a moment.
+"""
+
+import re
+import time
+import warnings
+from collections.abc import Sequence
+from contextlib import suppress
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from fdtasil.errors import ExpertError, FdtasilWarning, first_line, shown, warn
+from fdtasil.files.onnx.limits import limit_process
+from fdtasil.files.onnx.session import is_batched, open_session, rebatched, run_session
+
+if TYPE_CHECKING:
+    import onnxruntime
+
+    Session = onnxruntime.InferenceSession
+
+__all__ = ["OnnxPolicy", "cannot_be_asked", "open_policy", "open_within_limits"]
+
+_FLOATS = ("tensor(float)", "tensor(double)", "tensor(float16)")
+# Beside the models' own memory: the libraries, and copies of a model while it is opened.
+_ROOM, _COPIES = 2**30, 6
+_MEMORY = re.compile(
+    r"(?i)(^|[^a-z])(h|c)(x|n|0|_?(in|prev|t))?($|[^a-z])|state|hidden|cell|memory|rnn|lstm|gru|carry"
+)
+
+
+class OnnxPolicy:
+    """Answers (B, n) float32 with (B, m) float32; sent to another process, it opens itself there.
+
+    Args:
+        data: The model's bytes.
+        name: What to call it in messages.
+        output: Name of the output that holds the actions.
+        size: n.
+        rows: How many rows are asked at once; None for any number, 0 for one without a batch axis.
+        session: The model, where it is open already.
+    """
+
+    def __init__(
+        self,
+        data: bytes,
+        name: str,
+        output: str,
+        size: int,
+        rows: int | None,
+        session: "Session | None" = None,
+    ) -> None:
+        self._arguments = data, name, output, size, rows
+        self.output, self._size, self._rows = output, size, rows
+        self._session = open_session(data, name) if session is None else session
+
+    def __reduce__(self) -> tuple[type["OnnxPolicy"], tuple[bytes, str, str, int, int | None]]:
+        return OnnxPolicy, self._arguments
+
+    def __call__(self, observations: np.ndarray) -> np.ndarray:
+        """(B, n) float32 -> (B, m) float32."""
+        if self._rows is None:
+            return run_session(self._session, self.output, observations)
+        if self._rows == 0:
+            return self._one_by_one(observations)
+        return self._in_turn(observations, self._rows)
+
+    def _in_turn(self, observations: np.ndarray, size: int) -> np.ndarray:
+        empty = np.zeros((-len(observations) % size, self._size), np.float32)
+        padded = np.concatenate([observations, empty])
+        parts = [
+            run_session(self._session, self.output, padded[start : start + size])
+            for start in range(0, len(padded), size)
+        ]
+        return np.concatenate(parts)[: len(observations)]
+
+    def _one_by_one(self, observations: np.ndarray) -> np.ndarray:
+        zeros = np.zeros((1, self._size), np.float32)  # for an empty batch, to know the width
+        rows = observations if len(observations) else zeros
+        answers = [run_session(self._session, self.output, row) for row in rows]
+        return np.stack(answers)[: len(observations)]
+
+
+def open_policy(
+    data: bytes,
+    name: str,
+    observation_size: int | None,
+    action_size: int | None,
+    output: str | None,
+) -> tuple[OnnxPolicy, int, int]:
+    """Open a model, and ask it about a few observations.
+
+    Args:
+        data: The model's bytes.
+        name: What to call it.
+        observation_size: n, used where the file leaves it open.
+        action_size: m, which chooses among the outputs; or None.
+        output: Name of the output that holds the actions, or None.
+
+    Returns:
+        The policy, and its n and m.
+
+    Raises:
+        ExpertError: If it can't be opened or asked, or its signature is not a policy's.
+    """
+    session = open_session(data, name)
+    try:
+        n = _observation_size(session, name, observation_size)
+        chosen = _choose_output(session, name, action_size, output)
+        policy = _fastest(data, name, session, chosen, n)
+        answers = policy(np.zeros((2, n), np.float32))
+    except ExpertError:
+        raise
+    except Exception as error:  # onnxruntime has its own, and damaged names are no text
+        raise cannot_be_asked(name, error) from error
+    if answers.ndim != 2 or len(answers) != 2:
+        raise ExpertError(
+            f"{name} answers 2 observations with shape {answers.shape}",
+            "(2, m): one row of actions for each row of observations",
+            _wrapped(session, name, chosen, "rows", ".reshape(len(rows), -1)"),
+        )
+    return policy, n, answers.shape[1]
+
+
+def cannot_be_asked(name: str, error: Exception) -> ExpertError:
+    """Return the error of a model that fails to answer."""
+    limited = isinstance(error, (MemoryError, TimeoutError))
+    return ExpertError(
+        f"{name} can't be asked: {first_line(error)}",
+        "answers to a few observations",
+        "leave the file alone; if you know it, wrap a session of its own in a function"
+        if limited
+        else "export it again, and ask it with onnxruntime alone",
+    )
+
+
+def open_within_limits(
+    data: bytes,
+    name: str,
+    observation_size: int | None,
+    action_size: int | None,
+    output: str | None,
+    straight: bool,
+) -> None:
+    """Do what `open_policy` does, in a process that may be killed for it.
+
+    Args:
+        data: As there, like the next four.
+        name: As there.
+        observation_size: As there.
+        action_size: As there.
+        output: As there.
+        straight: Whether it is also asked what a torch twin of it is compared on.
+    """
+    limit_process(_ROOM + _COPIES * len(data))
+    warnings.simplefilter("ignore", FdtasilWarning)  # the parent opens it again, and warns
+    policy, n, _ = open_policy(data, name, observation_size, action_size, output)
+    if straight:
+        with suppress(Exception):  # what it raises, the parent will see
+            policy(np.random.default_rng(0).standard_normal((64, n)).astype(np.float32))
+
+
+def _observation_size(session: "Session", name: str, wanted: int | None) -> int:
+    inputs = session.get_inputs()
+    described = _described(inputs)
+    if len(inputs) != 1:
+        raise _several_inputs(session, name, described)
+    shape, kind = inputs[0].shape, inputs[0].type
+    if kind not in _FLOATS or len(shape) not in (1, 2):
+        raise ExpertError(
+            f"{name} has the input {described}",
+            "(batch, n) numbers of type float16, float32 or float64, or (n) of them",
+            "export the policy for flat observations",
+        )
+    n = shape[-1] if isinstance(shape[-1], int) else wanted
+    if n is None:
+        raise ExpertError(
+            f"{name} leaves its observation size open: {described}",
+            "a size in the file or from the caller",
+            "write load_expert(path, observation_size=...)",
+        )
+    return n
+
+
+def _several_inputs(session: "Session", name: str, described: str) -> ExpertError:
+    """Say whether they are a memory, or parts of an observation."""
+    inputs, outputs = session.get_inputs(), session.get_outputs()
+    shapes = [entry.shape for entry in outputs if len(entry.shape) == 3]
+    memory = any(_MEMORY.search(str(e.name)) or e.shape in shapes for e in inputs[1:])
+    found = f"{name} has {len(inputs)} inputs: {described}"
+    if memory:
+        return ExpertError(
+            f"{found}; they look like a policy's memory",
+            "one input (batch, n); policies with memory can't be distilled",
+            "choose a policy that depends on the observation only",
+        )
+    given = [entry.shape[-1] if entry.shape else None for entry in inputs]
+    widths = [width for width in given if isinstance(width, int)]
+    if len(widths) < len(inputs):
+        step = "wrap it in a function on batches that gives each input its columns"
+        return ExpertError(found, "one input (batch, n) with the whole observation", step)
+    ends = np.cumsum([0, *widths])
+    parts = [f"rows[:, {ends[k]}:{ends[k + 1]}]" for k in range(len(inputs))]
+    fitting = [entry.name for entry in outputs if entry.type in _FLOATS] or [outputs[0].name]
+    return ExpertError(
+        found,
+        "one input (batch, n) with the whole observation",
+        _wrapped(session, name, fitting[0], *parts),
+    )
+
+
+def _wrapped(session: "Session", name: str, output: str, *parts: str) -> str:
+    """Return the function that asks a model as it is; the last of `parts` may treat its answer."""
+    inputs = session.get_inputs()
+    treated = parts[-1] if len(parts) > len(inputs) else ""
+    types = {"tensor(double)": '.astype("float64")', "tensor(float16)": '.astype("float16")'}
+    feed = ", ".join(
+        f"{str(entry.name)!r}: {part}{types.get(entry.type, '')}"
+        for entry, part in zip(inputs, parts, strict=False)
+    )
+    return (
+        f"wrap it: session = onnxruntime.InferenceSession({name!r}); expert = lambda rows: "
+        f"session.run([{str(output)!r}], {{{feed}}})[0]{treated}"
+    )
+
+
+def _choose_output(
+    session: "Session", name: str, action_size: int | None, output: str | None
+) -> str:
+    outputs = session.get_outputs()
+    described = _described(outputs)
+    if output is not None:
+        if output not in [entry.name for entry in outputs]:
+            raise ExpertError(
+                f"{name} has no output {output!r}", f"one of {described}", "choose one of these"
+            )
+        return output
+    rank = len(session.get_inputs()[0].shape)
+    fitting = [entry.name for entry in outputs if _could_be_actions(entry, rank, action_size)]
+    # One number a row, without an axis of its own: what is wrong with it is said once it is asked.
+    flat = [e.name for e in outputs if e.type in _FLOATS and len(e.shape) < rank]
+    fitting = fitting or flat[:1]
+    if len(fitting) != 1:
+        raise ExpertError(
+            f"{name} has {len(fitting)} outputs that could be the actions: {described}",
+            f"one floating-point output (batch, {action_size or 'm'})",
+            'name it: load_expert(path, output="...") (--output on the command line)'
+            if fitting
+            else "check that expert and environment belong together",
+        )
+    return fitting[0]
+
+
+def _could_be_actions(entry: "onnxruntime.NodeArg", rank: int, action_size: int | None) -> bool:
+    if entry.type not in _FLOATS:
+        return False
+    # An exporter may leave the shape open; then only asking tells.
+    if not entry.shape or not isinstance(entry.shape[-1], int):
+        return True
+    return len(entry.shape) == rank and action_size in (None, entry.shape[-1])
+
+
+def _fastest(data: bytes, name: str, session: "Session", output: str, n: int) -> OnnxPolicy:
+    """Return the fastest way to ask that gives the answers of single rows."""
+    if len(session.get_inputs()[0].shape) == 1:
+        return _slow(OnnxPolicy(data, name, output, n, 0, session), 1, n)
+    if is_batched(session):
+        if _takes_batches(session, output, n):
+            return OnnxPolicy(data, name, output, n, None, session)
+        size = 1
+    else:
+        size = session.get_inputs()[0].shape[0]
+    in_turn = OnnxPolicy(data, name, output, n, size, session)
+    free = rebatched(data)
+    try:
+        at_once = OnnxPolicy(free, "the re-batched model", output, n, None)
+    except ExpertError:
+        return _slow(in_turn, size, n)
+    return at_once if _agree(at_once, in_turn, n) else _slow(in_turn, size, n)
+
+
+def _takes_batches(session: "Session", output: str, n: int) -> bool:
+    """Whether a free batch dimension is true: a constant inside the graph may hold another."""
+    try:
+        answers = run_session(session, output, np.zeros((3, n), np.float32))
+    except (MemoryError, TimeoutError):
+        raise
+    except Exception:  # onnxruntime has its own
+        return False
+    return answers.ndim != 2 or len(answers) == 3
+
+
+def _agree(at_once: OnnxPolicy, in_turn: OnnxPolicy, n: int) -> bool:
+    rows = np.random.default_rng(0).standard_normal((17, n)).astype(np.float32)
+    try:
+        fast, slow = at_once(rows), in_turn(rows)
+    except (MemoryError, TimeoutError):
+        raise
+    except Exception:  # a constant inside the graph still wants the old batch
+        return False
+    return fast.shape == slow.shape and np.allclose(fast, slow, rtol=1e-4, atol=1e-5)
+
+
+def _slow(in_turn: OnnxPolicy, size: int, n: int) -> OnnxPolicy:
+    rows = np.zeros((64 * size, n), np.float32)
+    in_turn(rows[:size])
+    start = time.perf_counter()
+    in_turn(rows)
+    seconds = (time.perf_counter() - start) / len(rows)
+    warn(
+        f"the model takes {size} row(s) at a time and can't be re-batched: asked in turn, "
+        f"{1e6 * seconds:.0f} microseconds a row (batches are about ten times faster); "
+        "export it with a free batch dimension to mend this"
+    )
+    return in_turn
+
+
+def _described(entries: "Sequence[onnxruntime.NodeArg]") -> str:
+    """Return inputs or outputs as a text; a file may have thousands of them."""
+    listed = ", ".join(_describe(entry) for entry in entries[:8])
+    return f"{listed}, ..." if len(entries) > 8 else listed
+
+
+def _describe(entry: "onnxruntime.NodeArg") -> str:
+    kind = entry.type.removeprefix("tensor(").removesuffix(")")
+    return shown(f"{entry.name} {kind} ({', '.join(str(size) for size in entry.shape)})")
