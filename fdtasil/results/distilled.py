@@ -16,11 +16,12 @@ from fdtasil.experts.expert import rows_text
 from fdtasil.experts.onnx_expert import COLUMNS
 from fdtasil.files.border import reads
 from fdtasil.files.lock import locked
-from fdtasil.files.plain import without_infinities
+from fdtasil.files.plain import as_kind, without_infinities
 from fdtasil.files.reading import from_json
 from fdtasil.files.run_format import CONFIG, check_free, stamped, unstamped
 from fdtasil.files.storage import add_to_folder, to_json, verify, write_bytes, write_folder
 from fdtasil.probes.answers import Answers
+from fdtasil.probes.calibration import Calibration
 from fdtasil.results.evaluation import Evaluation
 from fdtasil.results.figures import FIGURES
 from fdtasil.student.exports import export
@@ -162,7 +163,7 @@ class Distilled:
     def _read(cls, folder: Path, student_obs: StudentObservation | None) -> "Distilled":
         files = verify(folder)
         settings = unstamped(files[CONFIG], folder / CONFIG, older=True)
-        report = from_json(files["report.json"])
+        report = _read_report(files["report.json"])
         dataset = check_dataset(Dataset.from_bytes(files["demonstrations.npz"]))
         evaluation = report["evaluation"]
         return cls(
@@ -264,6 +265,21 @@ def _stored_view(
     if given is not None:
         return View.of(given, states)
     return View(Unseen(stored), None, 0, np.ones(states.shape[1], bool))
+
+
+_REPORT = {"env": str, "probes": str, "steps": int, "warnings": tuple[str, ...]}
+"""Types of what is used of a report later on."""
+
+
+def _read_report(data: bytes) -> dict[str, Any]:
+    report = from_json(data)
+    for name, kind in _REPORT.items():
+        as_kind(kind, report[name], name)
+    as_kind(str, report["versions"]["fdtasil"], "versions.fdtasil")
+    as_kind(str | None, report["expert"]["sha256"], "expert.sha256")
+    if report["calibration"] is not None:
+        Calibration.from_json(report["calibration"])
+    return report
 
 
 def _read_queries(queries: Any) -> dict[str, int]:
