@@ -1,11 +1,27 @@
 """Arguments that are looked at in one way everywhere, so that they are refused with one text."""
 
 import math
+import os
+from collections.abc import Collection
+from contextlib import suppress
 from numbers import Integral, Real
+from pathlib import Path
 
-from fdtasil.errors import SettingError
+import numpy as np
 
-__all__ = ["check_count", "check_number", "check_share"]
+from fdtasil.errors import SettingError, shown
+
+__all__ = [
+    "check_choice",
+    "check_count",
+    "check_flag",
+    "check_number",
+    "check_path",
+    "check_share",
+    "spelt",
+]
+
+_MOST = 2**53  # beyond it a float is no whole number any more, and nobody waits so long
 
 
 def check_count(name: str, value: object, least: int = 1, most: int | None = None) -> int:
@@ -26,12 +42,12 @@ def check_count(name: str, value: object, least: int = 1, most: int | None = Non
         5
     """
     number = int(value) if isinstance(value, Integral) and not isinstance(value, bool) else None
-    if number is not None and number >= least and (most is None or number <= most):
+    if number is not None and least <= number <= (_MOST if most is None else most):
         return number
     expected = "a positive integer" if least == 1 else f"an integer of at least {least}"
     if most is not None:
         expected = f"an integer from {least} to {most}"
-    raise SettingError(f"{name}={value!r}", expected, f"write for example {name}={max(least, 5)}")
+    raise SettingError(spelt(name, value), expected, _example(name, value, max(least, 5)))
 
 
 def check_number(name: str, value: object, *, positive: bool = False) -> float:
@@ -49,7 +65,7 @@ def check_number(name: str, value: object, *, positive: bool = False) -> float:
     if number is not None and (number > 0 or (number == 0 and not positive)) and number < math.inf:
         return number
     expected = "a positive number" if positive else "a number of at least 0"
-    raise SettingError(f"{name}={value!r}", expected, f"write for example {name}=1.0")
+    raise SettingError(spelt(name, value), expected, _example(name, value, 1.0))
 
 
 def check_share(name: str, value: object, *, whole: bool = True) -> float:
@@ -67,10 +83,67 @@ def check_share(name: str, value: object, *, whole: bool = True) -> float:
     if number is not None and (0 <= number < 1 or (number == 1 and whole)):
         return number
     expected = "a share from 0 to 1" if whole else "a share from 0 to below 1"
-    raise SettingError(f"{name}={value!r}", expected, f"write for example {name}=0.2")
+    raise SettingError(spelt(name, value), expected, _example(name, value, 0.2))
+
+
+def check_flag(name: str, value: object) -> bool:
+    """Return True or False; a text such as "False" is neither.
+
+    Raises:
+        SettingError: If it is something else.
+    """
+    if isinstance(value, bool | np.bool_):
+        return bool(value)
+    raise SettingError(spelt(name, value), "True or False", f"write {name}=True, or leave it out")
+
+
+def check_choice(name: str, value: object, choices: Collection[str]) -> str:
+    """Return one of some texts.
+
+    Raises:
+        SettingError: If it is another, or no text.
+    """
+    if isinstance(value, str) and value in choices:
+        return value
+    raise SettingError(spelt(name, value), f"one of {', '.join(choices)}", "choose one of these")
+
+
+def check_path(name: str, value: object) -> Path:
+    """Return a path of a file system.
+
+    Raises:
+        SettingError: If it is neither a text nor a path, or holds a NUL.
+    """
+    if isinstance(value, str | os.PathLike):
+        with suppress(TypeError):  # a path of bytes
+            path = Path(value)
+            if "\0" not in str(path):
+                return path
+    example = f'write for example {name}="runs/latest"'
+    raise SettingError(spelt(name, value), "a text, or a pathlib.Path", example)
+
+
+def spelt(name: str, value: object) -> str:
+    """Return `name=value` for a message, whatever the value is."""
+    try:
+        return shown(f"{name}={value!r}")
+    except Exception as error:  # a class of the caller's, or an int of 5,000 digits
+        return shown(f"{name}: a {type(value).__name__} ({type(error).__name__} when printed)")
 
 
 def _number(value: object) -> float | None:
     if isinstance(value, bool) or not isinstance(value, Real):
         return None
-    return float(value)
+    with suppress(OverflowError, ValueError, TypeError):
+        return float(value)
+    return None
+
+
+def _example(name: str, value: object, usual: float) -> str:
+    """Return what to write: what was meant, where a configuration file made a text of it."""
+    if isinstance(value, str):
+        with suppress(ValueError, OverflowError):  # is infinite
+            number = float(value)
+            meant = int(number) if number.is_integer() and isinstance(usual, int) else number
+            return f"write {name}={meant}, a number and no text (YAML reads 1e-3 as a text)"
+    return f"write for example {name}={usual}"

@@ -2,6 +2,7 @@
 
 import io
 import json
+import os
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from pathlib import Path
@@ -9,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from fdtasil.checks import check_path
 from fdtasil.demonstrations.states import Demonstrations
 from fdtasil.errors import SettingError, StorageError
 from fdtasil.files.arrays import arrays_from_bytes
@@ -100,7 +102,15 @@ def load_dataset(source: DatasetLike) -> Dataset:
     """
     if isinstance(source, Dataset):
         return check_dataset(source)
-    path = Path(source)
+    if not isinstance(source, str | os.PathLike):
+        raise SettingError(
+            f"dataset is a {type(source).__name__}",
+            "a Dataset, a run folder, or its demonstrations.npz",
+            "of arrays: Dataset(Demonstrations(observations, actions, episode, round, actions, "
+            'rewards, terminated), None, None, low, high, "name"), Demonstrations is in '
+            "fdtasil.demonstrations.states",
+        )
+    path = check_path("dataset", source)
     file = path / "demonstrations.npz" if path.is_dir() else path
     try:
         if path.is_dir() and is_written(path):
@@ -133,6 +143,8 @@ def check_dataset(dataset: Dataset) -> Dataset:
         arrays |= {name: getattr(answers, name) for name in ("displacements", "numbers", "values")}
         shapes |= {"displacements": "Pn", "numbers": "Nk", "values": "Nkpm"}
     sizes: dict[str, int] = {}
+    for name in shapes:
+        _check_kind(name, arrays[name])
     for name, letters in shapes.items():
         shape = arrays[name].shape
         agrees = len(shape) == len(letters) and all(
@@ -148,7 +160,8 @@ def check_dataset(dataset: Dataset) -> Dataset:
             )
     if answers is not None:
         _check_numbers(answers)
-    for name in ("observations", "actions", "displacements", "values"):
+    _check_bounds(dataset.low, dataset.high)
+    for name in ("observations", "actions", "taken", "displacements", "values", "rewards"):
         if name in arrays and not np.isfinite(arrays[name]).all():
             bad = np.flatnonzero([not np.isfinite(row).all() for row in arrays[name]])
             raise SettingError(
@@ -158,6 +171,30 @@ def check_dataset(dataset: Dataset) -> Dataset:
                 "drop these rows, and find out what made them",
             )
     return dataset
+
+
+def _check_kind(name: str, array: object) -> None:
+    """Refuse what numpy would turn into numbers that were never meant."""
+    good = isinstance(array, np.ndarray) and array.dtype.kind in "biuf"
+    if good and not np.ma.is_masked(array):
+        return
+    what = f"an array of {array.dtype}" if isinstance(array, np.ndarray) else type(array).__name__
+    raise SettingError(
+        f"demonstrations whose {name} are {'masked' if good else what}",
+        "a numpy array of plain numbers",
+        f"drop the masked rows, or write numpy.asarray({name}, numpy.float32)",
+    )
+
+
+def _check_bounds(low: np.ndarray, high: np.ndarray) -> None:
+    if (low < high).all():
+        return
+    first = int((~(low < high)).argmax())
+    raise SettingError(
+        f"demonstrations whose action {first} has the bounds {low[first]:g} to {high[first]:g}",
+        "lower bounds below upper bounds; -inf and inf where there is none",
+        "take low and high from the environment's action_space",
+    )
 
 
 def _check_numbers(answers: Answers) -> None:
@@ -190,7 +227,7 @@ def _as_kind(name: str, array: np.ndarray) -> np.ndarray:
         if int(array.min()) < room.min or int(array.max()) > room.max:
             raise ValueError(f"{name} beyond {kind}")
     with np.errstate(over="ignore"):  # infinite then, which is refused as such
-        return array.astype(kind, copy=False)
+        return np.asarray(array, kind, order="C")
 
 
 def _read(arrays: Mapping[str, np.ndarray]) -> Dataset:

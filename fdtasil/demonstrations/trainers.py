@@ -1,13 +1,13 @@
 """Who acts in round i: that is all a trainer is."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
-from typing import Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import numpy as np
 
-from fdtasil.checks import check_count, check_share
+from fdtasil.checks import check_choice, check_count, check_number, check_share, spelt
 from fdtasil.errors import SettingError
 from fdtasil.experts.expert import Expert
 from fdtasil.rollouts.behaviours import Behaviour, Decision, Policy
@@ -106,9 +106,8 @@ class DAgger:
     name: str = field(default="dagger", init=False)
 
     def __post_init__(self) -> None:
-        _check_updates(self.updates)
-        if self.mix not in ("blend", "switch"):
-            raise SettingError(f"mix={self.mix!r}", '"blend" or "switch"', "choose one of these")
+        object.__setattr__(self, "updates", _checked_updates(self.updates))
+        check_choice("mix", self.mix, ("blend", "switch"))
         if not callable(self.beta):
             check_share("beta", self.beta)
 
@@ -165,9 +164,8 @@ class Dart:
     name: str = field(default="dart", init=False)
 
     def __post_init__(self) -> None:
-        _check_updates(self.updates)
-        if not 0 <= self.alpha < float("inf"):
-            raise SettingError(f"alpha={self.alpha!r}", "a number of at least 0", "write alpha=0")
+        object.__setattr__(self, "updates", _checked_updates(self.updates))
+        object.__setattr__(self, "alpha", check_number("alpha", self.alpha))
         object.__setattr__(self, "extra", check_count("extra", self.extra))
 
     def rounds(self, episodes: int) -> list[int]:
@@ -232,14 +230,18 @@ def _between(updates: Sequence[int], episodes: int) -> list[int]:
     return [end - start for start, end in zip([0, *ends], ends, strict=False)]
 
 
-def _check_updates(updates: Sequence[int]) -> None:
-    numbers = [check_count("updates", update) for update in updates]
+def _checked_updates(updates: object) -> tuple[int, ...]:
+    example = "write updates=(1, 5, 20, 30)"
+    try:
+        if isinstance(updates, str | bytes | Mapping):
+            raise TypeError
+        numbers = tuple(check_count("updates", update) for update in updates)  # pyright: ignore
+    except TypeError:
+        expected = "increasing numbers of episodes"
+        raise SettingError(spelt("updates", updates), expected, example) from None
     if not all(a < b for a, b in pairwise([0, *numbers])):
-        raise SettingError(
-            f"updates={updates!r}",
-            "increasing numbers of episodes",
-            "write updates=(1, 5, 20, 30)",
-        )
+        raise SettingError(f"updates={numbers}", "increasing numbers of episodes", example)
+    return numbers
 
 
 TRAINERS: dict[str, Callable[[], Trainer]] = {
@@ -261,15 +263,20 @@ def describe_trainer(trainer: Trainer) -> str:
     return ",".join([trainer.name, *odd])
 
 
-def trainer_of(trainer: str | Trainer) -> Trainer:
-    """Return the trainer of that name, or the trainer itself.
+def trainer_of(trainer: Any) -> Trainer:
+    """Return the trainer of that name, or the trainer itself; a class of one is called.
 
     Raises:
-        SettingError: If there is none of that name.
+        SettingError: If there is none of that name, or it is no trainer.
     """
-    if not isinstance(trainer, str):
-        return trainer
-    if trainer not in TRAINERS:
-        known = ", ".join(TRAINERS)
-        raise SettingError(f"trainer={trainer!r}", f"one of {known}", "choose one of these")
-    return TRAINERS[trainer]()
+    if isinstance(trainer, str):
+        return TRAINERS[check_choice("trainer", trainer, TRAINERS)]()
+    made = trainer() if any(trainer is known for known in TRAINERS.values()) else trainer
+    methods = all(callable(getattr(made, m, None)) for m in ("rounds", "behaviour", "queries"))
+    if isinstance(made, type) or not methods or not isinstance(getattr(made, "name", None), str):
+        raise SettingError(
+            spelt("trainer", trainer),
+            f"one of {', '.join(TRAINERS)}, or an object with name, rounds, behaviour and queries",
+            'write for example trainer="dagger", or trainer=fdtasil.DAgger(beta=0.5)',
+        )
+    return made

@@ -4,7 +4,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-from fdtasil.checks import check_count, check_number
+from fdtasil.checks import check_choice, check_count, check_flag, check_number, spelt
 from fdtasil.errors import SettingError
 from fdtasil.probes.adaptive import AdaptiveDirections
 from fdtasil.probes.directions import (
@@ -63,8 +63,15 @@ class Probes:
         if self.radius is not None:
             number = check_number("radius", self.radius, positive=True)
             object.__setattr__(self, "radius", number)
-        if self.space not in (None, "whitened", "raw"):
-            raise SettingError(f"space={self.space!r}", '"whitened" or "raw"', "choose one")
+        if self.space is not None:
+            check_choice("space", self.space, ("whitened", "raw"))
+        object.__setattr__(self, "resample", check_flag("resample", self.resample))
+        if not isinstance(self.directions, tuple(DIRECTIONS.values())) or not isinstance(
+            self.stencil, Stencil | None
+        ):
+            found = f"{spelt('directions', self.directions)}, {spelt('stencil', self.stencil)}"
+            example = 'write for example fdtasil.Probes.parse("sphere:10,forward")'
+            raise SettingError(found, "a design, and a stencil or None", example)
         if self.directions.exact and self.stencil is None:
             object.__setattr__(self, "stencil", EXACT)
         if (self.stencil is EXACT) != self.directions.exact:
@@ -74,7 +81,7 @@ class Probes:
                 "a finite stencil with asked directions, and none with differentiated ones",
                 'write probes="jacobian" for the exact derivative',
             )
-        if self.per_step not in (None, "all"):
+        if self.per_step is not None and not _is_all(self.per_step):
             object.__setattr__(self, "per_step", check_count("per_step", self.per_step))
 
     @staticmethod
@@ -102,7 +109,7 @@ class Probes:
         try:
             count = check_count("probes", spec, least=0)
         except SettingError:
-            raise SettingError(f"probes={spec!r}", _GRAMMAR, _EXAMPLES) from None
+            raise SettingError(spelt("probes", spec), _GRAMMAR, _EXAMPLES) from None
         return Probes(AdaptiveDirections(count)) if count else None
 
     def describe(self) -> str:
@@ -160,6 +167,10 @@ class Probes:
     def used_per_visit(self, count: int) -> int:
         """Return how many of a state's `count` probes one visit uses."""
         return count if self.per_step == "all" else min(self.per_step or 1, count)
+
+
+def _is_all(value: object) -> bool:
+    return isinstance(value, str) and value == "all"
 
 
 def _shortest(number: float) -> str:

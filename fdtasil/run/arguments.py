@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, replace
 
-from fdtasil.checks import check_count
+from fdtasil.checks import check_count, spelt
 from fdtasil.demonstrations.dataset import Dataset
 from fdtasil.demonstrations.trainers import BehaviourCloning, Trainer, trainer_of
 from fdtasil.errors import SettingError
@@ -16,7 +16,7 @@ from fdtasil.run.configuration import Configuration
 from fdtasil.run.presets import Preset, preset_of
 from fdtasil.run.subject import Subject
 from fdtasil.seeding import episode_seeds
-from fdtasil.student.architectures import Architecture
+from fdtasil.student.architectures import Architecture, check_architecture
 from fdtasil.student.fit import Fit
 from fdtasil.student.view import StudentObservation, describe_view
 
@@ -83,7 +83,7 @@ class Arguments:
             usual_radius=self.preset.radius,
             probes_given=stored,
             observation_size=subject.observation_size,
-            student_obs=describe_view(self.student_obs),
+            student_obs=describe_view(self.student_obs, subject.observation_size),
             student=self.student,
             fit=self.fit,
             episodes=self.episodes,
@@ -118,7 +118,7 @@ def read_arguments(
         SettingError: If one can't be used, or two don't go together.
     """
     defaults = preset_of(preset)
-    fit = defaults.fit if fit is None else fit
+    fit = defaults.fit if fit is None else _checked_fit(fit)
     if max_queries is not None:
         check_count("max_queries", max_queries, least=0)
     return Arguments(
@@ -129,13 +129,26 @@ def read_arguments(
         episodes=_episodes_of(episodes, given),
         horizon=None if horizon is None else check_count("horizon", horizon),
         seed=check_count("seed", seed, 0, 2**32 - 1),
-        student=student,
+        student=check_architecture(student),
         student_obs=student_obs,
         fit=fit,
         evaluation_episodes=check_count("evaluation_episodes", evaluation_episodes, least=0),
         max_queries=max_queries,
-        device=device,
+        device=_checked_device(device),
     )
+
+
+def _checked_device(device: object) -> str:
+    if isinstance(device, str):
+        return device
+    raise SettingError(spelt("device", device), '"cpu", "cuda" or "cuda:N"', 'write device="cpu"')
+
+
+def _checked_fit(fit: object) -> Fit:
+    if isinstance(fit, Fit):
+        return fit
+    example = "write for example fit=fdtasil.Fit(steps=4000)"
+    raise SettingError(spelt("fit", fit), "fdtasil.Fit(...)", example)
 
 
 def _source_of(

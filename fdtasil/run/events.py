@@ -6,7 +6,8 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, Literal
 
-from fdtasil.errors import SettingError
+from fdtasil.checks import check_path, spelt
+from fdtasil.errors import SettingError, shown
 from fdtasil.results.evaluation import Evaluation
 from fdtasil.student.policy import Student
 
@@ -39,8 +40,20 @@ Callback = Callable[[Event], None]
 
 
 def tell_all(callback: Callback | Sequence[Callback] | None) -> Callback:
-    """Return one callback that tells all."""
-    callbacks = [callback] if callable(callback) else list(callback or ())
+    """Return one callback that tells all.
+
+    Raises:
+        SettingError: If one of them can't be called with an event.
+    """
+    given: Any = () if callback is None else callback
+    several = isinstance(given, Sequence) and not isinstance(given, str | bytes)
+    callbacks: list[Any] = list(given) if several and not callable(given) else [given]
+    if not all(callable(one) and not isinstance(one, type) for one in callbacks):
+        raise SettingError(
+            spelt("callback", callback),
+            "a function of an fdtasil.Event, or several in a list",
+            'write for example callback=fdtasil.Log("runs/log", "csv")',
+        )
 
     def tell(event: Event) -> None:
         for one in callbacks:
@@ -67,7 +80,8 @@ class Log:
     """
 
     def __init__(self, folder: str | Path, *formats: str) -> None:
-        unknown = sorted(set(formats) - set(_FORMATS))
+        where = check_path("folder", folder)
+        unknown = sorted(shown(one) for one in formats if not _is_format(one))
         if unknown or not formats:
             found = f"log formats: {', '.join(unknown) or 'none'}"
             raise SettingError(found, f"some of {', '.join(_FORMATS)}", 'write for example "csv"')
@@ -77,7 +91,7 @@ class Log:
                 "the package tensorboard",
                 'pip install "fdtasil[tb]"',
             )
-        self._folder, self._formats = Path(folder).absolute(), formats
+        self._folder, self._formats = where.absolute(), formats
         self._logger: Any = None
 
     def __call__(self, event: Event) -> None:
@@ -100,6 +114,10 @@ class Log:
         beside = [self._folder.with_name(f"{self._folder.name}-{n}") for n in range(2, 1000)]
         folder = next(path for path in (self._folder, *beside) if not path.exists())
         return logger.configure(str(folder), list(self._formats))
+
+
+def _is_format(value: object) -> bool:
+    return isinstance(value, str) and value in _FORMATS
 
 
 _FORMATS = ("stdout", "log", "csv", "json", "tensorboard")

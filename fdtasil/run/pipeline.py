@@ -5,7 +5,7 @@ from pathlib import Path
 
 import torch
 
-from fdtasil.checks import check_count
+from fdtasil.checks import check_count, check_flag, check_path
 from fdtasil.compute import pick_device, torch_settings
 from fdtasil.demonstrations.dataset import Dataset, DatasetLike, load_dataset
 from fdtasil.demonstrations.trainers import Trainer
@@ -134,7 +134,8 @@ def distill(
         >>> result.student.predict(result.demonstrations.observations[0])[0].shape
         (1,)
     """
-    folder = _folder_of(out, resume)
+    folder, force = _folder_of(out, resume), check_flag("force", force)
+    progress = check_flag("progress", progress)
     given = None if dataset is None else load_dataset(dataset)
     arguments = read_arguments(
         given,
@@ -151,7 +152,7 @@ def distill(
         max_queries=max_queries,
         device=device,
     )
-    torch_device, told = pick_device(device), tell_all(callback)
+    torch_device, told = pick_device(arguments.device), tell_all(callback)
     with heard_warnings() as notes, open_subject(expert, env, given) as subject:
         run = arguments.configure(subject)
         run.check_budget()
@@ -214,7 +215,8 @@ def evaluate(
         1.0
     """
     check_count("seed", seed, 0, 2**32 - 1)
-    count, bars = check_count("episodes", episodes), Progress(progress)
+    force = check_flag("force", force)
+    count, bars = check_count("episodes", episodes), Progress(check_flag("progress", progress))
     with EnvironmentPool(env) as pool, torch_settings(torch.device("cpu")):
         n, m = pool.boxes.observation_size, pool.boxes.action_size
         black_box, length = load_expert(expert, n, m), resolve_horizon(horizon, pool)
@@ -232,9 +234,9 @@ def _folder_of(out: str | Path | None, resume: str | Path | None) -> Path | None
     if out is not None and resume is not None:
         found = f"out={str(out)!r} beside resume={str(resume)!r}"
         raise SettingError(found, "one folder", "leave out= out: a resumed run stays in its own")
-    path = out if resume is None else resume
+    name, path = ("out", out) if resume is None else ("resume", resume)
     # Absolute from the beginning: an environment may change the working folder.
-    return None if path is None else Path(path).absolute()
+    return None if path is None else check_path(name, path).absolute()
 
 
 def _collecting(run: Configuration, subject: Subject, bars: Progress) -> Collecting | None:

@@ -3,7 +3,7 @@
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
-from fdtasil.errors import SettingError
+from fdtasil.checks import check_choice
 from fdtasil.probes.adaptive import AdaptiveDirections
 from fdtasil.probes.directions import RandomSphere
 from fdtasil.probes.source import Probes
@@ -79,8 +79,4 @@ def preset_of(name: str) -> Preset:
     Raises:
         SettingError: If there is none.
     """
-    if name not in PRESETS:
-        raise SettingError(
-            f"preset={name!r}", f"one of {', '.join(PRESETS)}", "choose one of these"
-        )
-    return PRESETS[name]
+    return PRESETS[check_choice("preset", name, PRESETS)]

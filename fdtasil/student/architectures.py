@@ -1,17 +1,26 @@
 """What a student's network looks like: between normalised observations and squashed actions."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass
 from itertools import pairwise
 from typing import Any, Protocol
 
+import numpy as np
 import torch
 from torch import nn
 
-from fdtasil.checks import check_count
+from fdtasil.checks import check_choice, check_count, spelt
 from fdtasil.errors import SettingError
 
-__all__ = ["ACTIVATIONS", "ARCHITECTURES", "Architecture", "Mlp", "architecture_of", "describe"]
+__all__ = [
+    "ACTIVATIONS",
+    "ARCHITECTURES",
+    "Architecture",
+    "Mlp",
+    "architecture_of",
+    "check_architecture",
+    "describe",
+]
 
 ACTIVATIONS: dict[str, Callable[[], nn.Module]] = {
     "elu": nn.ELU,
@@ -50,16 +59,19 @@ class Mlp:
     activation: str = "gelu"
 
     def __post_init__(self) -> None:
-        widths = self.hidden if isinstance(self.hidden, Iterable) else (self.hidden,)
-        if isinstance(self.hidden, str):
-            raise SettingError(f"hidden={self.hidden!r}", "positive integers", "write (256, 256)")
-        object.__setattr__(self, "hidden", tuple(check_count("hidden", w) for w in widths))
-        if self.activation not in ACTIVATIONS:
+        given: object = self.hidden
+        given = given.tolist() if isinstance(given, np.ndarray) else given
+        if isinstance(given, str | bytes | Mapping):
             raise SettingError(
-                f"activation={self.activation!r}",
-                f"one of {', '.join(ACTIVATIONS)}",
-                'write for example activation="gelu"',
+                spelt("hidden", given), "positive integers", "write for example hidden=(256, 256)"
             )
+        widths = given if isinstance(given, Iterable) else (given,)
+        try:
+            object.__setattr__(self, "hidden", tuple(check_count("hidden", w) for w in widths))
+        except TypeError as error:  # says that it can be iterated over, and can't
+            example = "write for example hidden=(256, 256)"
+            raise SettingError(spelt("hidden", given), "positive integers", example) from error
+        check_choice("activation", self.activation, ACTIVATIONS)
 
     def build(
         self, observation_size: int, action_size: int, random: torch.Generator
@@ -75,6 +87,25 @@ class Mlp:
 ARCHITECTURES: dict[str, Callable[..., Architecture]] = {"mlp": Mlp}
 """Every architecture by the name that files and configurations call it."""
 _USUAL = "mlp"  # which the files of students do not name
+
+
+def check_architecture(student: object) -> Architecture:
+    """Return the architecture that a caller means; a class of one is called.
+
+    Raises:
+        SettingError: If it is none that files can name.
+    """
+    made = student() if isinstance(student, type) and _is_known(student) else student
+    if _is_known(type(made)):
+        return made  # pyright: ignore[reportReturnType]
+    known = ", ".join(getattr(kind, "__name__", name) for name, kind in ARCHITECTURES.items())
+    raise SettingError(
+        spelt("student", student), known, "write for example student=fdtasil.Mlp((64, 64))"
+    )
+
+
+def _is_known(kind: type) -> bool:
+    return any(kind is known for known in ARCHITECTURES.values())
 
 
 def describe(architecture: Architecture) -> dict[str, Any]:

@@ -76,9 +76,10 @@ class Fit:
     def __post_init__(self) -> None:
         for name in ("steps", "epochs", "batch_size", "order", "patience"):
             self._check(name, check_count)
-        for name in ("learning_rate", "weight_decay", "epsilon", "weight", "curvature_weight"):
+        for name in ("weight_decay", "epsilon", "weight", "curvature_weight"):
             self._check(name, check_number)
-        self._check("max_gradient_norm", partial(check_number, positive=True))
+        for name in ("learning_rate", "max_gradient_norm"):
+            self._check(name, partial(check_number, positive=True))
         self._check("validation", partial(check_share, whole=False))
         if self.order > 2:
             raise SettingError(f"order={self.order}", "1 or 2", "write order=1; probes=0 is 0")

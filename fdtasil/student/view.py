@@ -3,12 +3,14 @@
 import operator
 import pickle
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 
+from fdtasil.checks import spelt
 from fdtasil.demonstrations.states import Demonstrations
-from fdtasil.errors import SettingError
+from fdtasil.errors import SettingError, first_line
 from fdtasil.probes.answers import Answers
 from fdtasil.rollouts.behaviours import Policy
 
@@ -88,11 +90,9 @@ class View:
         n = states.shape[1]
         if student_obs is None:
             return View(_whole, None, n, np.ones(n, bool))
-        if callable(student_obs):
+        if callable(student_obs) and not isinstance(student_obs, type):
             return _from_function(student_obs, states)
-        columns = _indices(student_obs)
-        if not columns or not all(0 <= index < n for index in columns):
-            raise _not_indices(student_obs, f"indices from 0 to {n - 1}, at least one")
+        columns = _indices(student_obs, n)
         seen = np.isin(np.arange(n), columns)
         return View(_Columns(columns), columns, len(columns), seen)
 
@@ -102,7 +102,7 @@ class View:
         try:
             pickle.dumps(look)
         except Exception:  # functions of users raise anything
-            look = Unseen(str(describe_view(look)))
+            look = Unseen(_called(look))
         return View, (look, self.columns, self.size, self.seen)
 
     def policy(self, student: Policy) -> Policy:
@@ -150,32 +150,63 @@ class View:
         return seen.reshape(*points.shape[:2], -1) - centres[:, None, :]
 
 
-def describe_view(student_obs: StudentObservation | None) -> tuple[int, ...] | str | None:
-    """Return a view as it is written into a configuration."""
+def describe_view(student_obs: object, n: int) -> tuple[int, ...] | str | None:
+    """Return a view of n coordinates as it is written into a configuration.
+
+    Raises:
+        SettingError: If it is neither a function nor a choice of them.
+    """
     if student_obs is None:
         return None
-    if callable(student_obs):
-        return f"the function {getattr(student_obs, '__name__', type(student_obs).__name__)}"
-    return _indices(student_obs)
+    if callable(student_obs) and not isinstance(student_obs, type):
+        return _called(student_obs)
+    return _indices(student_obs, n)
 
 
-def _indices(student_obs: Sequence[int]) -> tuple[int, ...]:
-    try:
+def _called(function: Callable[..., object]) -> str:
+    return f"the function {getattr(function, '__name__', type(function).__name__)}"
+
+
+def _indices(student_obs: object, n: int) -> tuple[int, ...]:
+    expected = f"indices from 0 to {n - 1}, at least one; {n} times True or False; or a function"
+    columns: tuple[int, ...] = ()
+    with suppress(TypeError, ValueError, OverflowError):
         mask = np.asarray(student_obs)
-        chosen = np.flatnonzero(mask) if mask.dtype == bool else student_obs
-        return tuple(operator.index(index) for index in chosen)
-    except TypeError:
-        raise _not_indices(student_obs, "integers, a boolean mask, or a function") from None
+        if mask.dtype != bool:
+            columns = tuple(operator.index(index) for index in student_obs)  # pyright: ignore
+        elif mask.shape == (n,):
+            columns = tuple(np.flatnonzero(mask).tolist())
+    if not columns or np.ma.is_masked(student_obs) or not all(0 <= i < n for i in columns):
+        example = f"write for example student_obs=range({min(n, 10)})"
+        raise SettingError(spelt("student_obs", student_obs), expected, example)
+    return columns
 
 
-def _not_indices(student_obs: object, expected: str) -> SettingError:
-    example = "write for example student_obs=range(10)"
-    return SettingError(f"student_obs={student_obs!r}", expected, example)
+@dataclass(frozen=True)
+class _Copying:
+    """A user's function, which may work in place or return the same buffer each time."""
+
+    function: Callable[[np.ndarray], np.ndarray]
+
+    @property
+    def __name__(self) -> str:
+        return getattr(self.function, "__name__", type(self.function).__name__)
+
+    def __call__(self, rows: np.ndarray) -> np.ndarray:
+        return np.array(self.function(rows.copy()))
 
 
-def _from_function(function: Callable[[np.ndarray], np.ndarray], states: np.ndarray) -> View:
-    n, found = states.shape[1], np.asarray(function(states))
-    alone = np.asarray(function(states[:1]))
+def _from_function(given: Callable[[np.ndarray], np.ndarray], states: np.ndarray) -> View:
+    n, function = states.shape[1], _Copying(given)
+    try:
+        found, alone = np.asarray(function(states)), np.asarray(function(states[:1]))
+    except Exception as error:
+        raise SettingError(
+            f"student_obs raised {type(error).__name__} on {states.shape} observations: "
+            f"{first_line(error)}",
+            "a function (B, n) -> (B, k) of each row on its own",
+            "call it on such a batch on its own, and mend it",
+        ) from error
     if found.ndim != 2 or len(found) != len(states) or not np.allclose(alone[0], found[0]):
         raise SettingError(
             f"student_obs maps {states.shape} to {found.shape}",
