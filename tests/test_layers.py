@@ -129,3 +129,45 @@ print(fdtasil.__file__, result.report["versions"]["fdtasil"])
 
 def test_the_face_has_what_it_names():
     assert all(hasattr(fdtasil, name) for name in fdtasil.__all__)
+
+
+# What writes, removes or makes files, whatever it is called on.
+WRITERS = {"write_text", "rmtree", "unlink", "rmdir", "mkdir", "makedirs", "touch", "open"}
+WRITERS |= {"symlink_to", "hardlink_to", "mkfifo", "copyfile", "copytree", "mkstemp"}
+ALLOWED = {
+    ("experts/http_expert.py", "json.loads"),  # of an answer, whose size is bounded there
+    ("experts/worker_process.py", "os.open"),  # nothing, in place of what it is not to read
+    ("probes/answers.py", "Path('/sys/fs/cgroup/memory.max').read_text"),  # the kernel's own
+    ("run/configuration.py", "json.loads"),  # of what it has just written
+    ("shell/main.py", "os.open"),  # nothing, in place of a pipe that was closed
+}
+
+
+def _calls(path: Path) -> set[str]:
+    """Return what a file calls, with the name of what it is called on."""
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Call):
+            function = node.func
+            if isinstance(function, ast.Name):
+                found.add(function.id)
+            if isinstance(function, ast.Attribute):
+                found.add(f"{ast.unparse(function.value)}.{function.attr}")
+    return found
+
+
+def test_one_room_reads_and_writes_files():
+    """Paths are opened in `files` alone, which looks at names, links, kinds and sizes."""
+    for path in FILES:
+        name = str(path.relative_to(HOUSE))
+        for call in _calls(path) if _room(path) != "files" else ():
+            assert not _touches_files(call) or (name, call) in ALLOWED, f"{name} calls {call}"
+
+
+def _touches_files(call: str) -> bool:
+    owner, _, method = call.rpartition(".")
+    if call in ("json.load", "json.loads", "np.load", "numpy.load"):
+        return True  # of a file's bytes: `files.reading` and `files.arrays` bound them
+    if method == "write_bytes":  # a function of ours has the same name
+        return bool(owner)
+    return method in WRITERS | {"read_bytes", "read_text"}

@@ -23,7 +23,7 @@ from toy_environments import Integrator
 
 import fdtasil
 from fdtasil.demonstrations.dataset import Dataset
-from fdtasil.errors import FdtasilError, FdtasilWarning, SettingError, StorageError
+from fdtasil.errors import ExpertError, FdtasilError, FdtasilWarning, SettingError, StorageError
 from fdtasil.files.lock import locked
 from fdtasil.files.names import inside
 from fdtasil.files.plain import from_plain, to_plain
@@ -570,6 +570,80 @@ def test_a_reader_in_the_middle_of_a_move_reads_again(tmp_path, monkeypatch):
     assert verify(folder) == new
 
 
+SAVER = """
+import sys, warnings
+from pathlib import Path
+import torch
+torch.set_num_threads(1)
+import fdtasil
+from fdtasil.results import figures
+figures.FIGURES.clear()
+own, folder = map(Path, sys.argv[1:])
+result = fdtasil.Distilled.load(own)
+print("ready", flush=True)
+for line in sys.stdin:
+    try:
+        result.save(folder)
+        print("saved", flush=True)
+    except Exception as error:
+        print(type(error).__name__, str(error).splitlines()[0], flush=True)
+"""
+READER = """
+import sys, time
+from pathlib import Path
+import fdtasil
+folder, count = Path(sys.argv[1]), int(sys.argv[2])
+fdtasil.Distilled.load(folder)
+print("ready", flush=True)
+sys.stdin.readline()
+for _ in range(count):
+    try:
+        fdtasil.Distilled.load(folder)
+        print("read", flush=True)
+    except Exception as error:
+        print(type(error).__name__, str(error).splitlines()[0], flush=True)
+    time.sleep(0.01)
+"""
+
+
+def child(script, *arguments):
+    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "text": True, "bufsize": 1}
+    return subprocess.Popen([sys.executable, "-c", script, *map(str, arguments)], **pipes)
+
+
+@pytest.mark.fault(132)
+@pytest.mark.parametrize(
+    ("pairs", "reads"), [(3, 20), pytest.param(300, 1000, marks=pytest.mark.slow)]
+)
+def test_simultaneous_saves_and_reads(pairs, reads, quick, linear, tmp_path, figure):
+    other = fdtasil.distill(linear, TOY, 3, seed=1, **QUICK)
+    owns = [quick.save(tmp_path / "a"), other.save(tmp_path / "b")]
+    folder = quick.save(tmp_path / "run")
+    whole = {quick.student.to_bytes(), other.student.to_bytes()}
+    savers = [child(SAVER, own, folder) for own in owns]
+    reader = child(READER, folder, reads)
+    processes = [*savers, reader]
+    try:
+        assert [one.stdout.readline() for one in processes] == ["ready\n"] * 3
+        reader.stdin.write("go\n")
+        outcomes = []
+        for _ in range(pairs):
+            for one in savers:
+                one.stdin.write("go\n")
+            outcomes += [one.stdout.readline().strip() for one in savers]
+            assert fdtasil.Distilled.load(folder).student.to_bytes() in whole
+        found = [reader.stdout.readline().strip() for _ in range(reads)]
+    finally:
+        for one in processes:
+            one.kill()
+            one.communicate()
+    assert set(outcomes) == {"saved"}
+    assert set(found) == {"read"}
+    assert sorted(path.name for path in folder.iterdir() if path.name.startswith(".")) == []
+    figure(f"{pairs} pairs of simultaneous saves", "all saved, 0 unreadable")
+    figure(f"{reads} reads beside saves", "0 false alarms")
+
+
 class Wanderer(Integrator):
     """Changes the working folder, as some simulators do."""
 
@@ -807,6 +881,50 @@ def test_arrays_of_other_types_become_ours_or_are_refused(quick):
     }.items():
         with pytest.raises(StorageError, match="not demonstrations"):
             read(**{name: value})
+
+
+# --- the hub
+
+
+def no_hash(name):
+    from huggingface_hub.hf_api import BlobLfsInfo, RepoSibling
+
+    large = BlobLfsInfo(size=3, sha256="", pointer_size=130)
+    return {
+        "not listed": {},
+        "no hash": {"e.onnx": RepoSibling(rfilename="e.onnx", size=3)},
+        "an empty hash": {"e.onnx": RepoSibling(rfilename="e.onnx", size=3, blob_id="")},
+        "a store without one": {
+            "e.onnx": RepoSibling(rfilename="e.onnx", size=3, blob_id="x", lfs=large)
+        },
+    }[name]
+
+
+@pytest.mark.fault(140)
+@pytest.mark.parametrize("name", ["not listed", "no hash", "an empty hash", "a store without one"])
+def test_a_file_of_the_hub_without_a_hash_is_not_kept(name, tmp_path, monkeypatch):
+    pytest.importorskip("huggingface_hub")
+    from fdtasil.experts import hub
+
+    def never(uri):
+        raise AssertionError("downloaded")
+
+    commit = "a" * 40
+    monkeypatch.setenv("HF_ASSETS_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr(hub, "look_up", lambda uri: (uri, no_hash(name)))
+    monkeypatch.setattr(hub, "download", never)
+    with pytest.raises(ExpertError, match=r"no hash of e\.onnx"):
+        fdtasil.load_expert(f"hf://org/repo/e.onnx@{commit}")
+    assert not [path for path in (tmp_path / "cache").rglob("*") if path.is_file()]
+
+
+@pytest.mark.fault(140)
+@pytest.mark.parametrize(
+    "uri", ["hf://../../e.onnx", "hf://org/../e.onnx", "hf://org/repo/../e.onnx"]
+)
+def test_a_file_of_the_hub_has_a_name_of_its_own(uri):
+    with pytest.raises(ExpertError, match=r"hf://org/repo/"):
+        fdtasil.load_expert(uri)
 
 
 # --- what is no plain file
