@@ -6,13 +6,15 @@ import socket
 import ssl
 import threading
 import time
+from contextlib import suppress
 from http import HTTPStatus
+from types import TracebackType
 from typing import TypeGuard
 from urllib.parse import SplitResult, urlsplit
 
 import numpy as np
 
-from fdtasil.errors import ExpertError
+from fdtasil.errors import ExpertError, first_line, shown, without_secrets
 from fdtasil.experts.expert import Expert
 
 __all__ = ["is_http_url", "open_http"]
@@ -64,14 +66,15 @@ def _parse(url: str) -> SplitResult:
     try:
         parts = urlsplit(url)
         usable = bool(parts.hostname) and parts.port != 0 and url.isascii() and " " not in url
-    except ValueError as error:  # a port that is no number, half an IPv6 address
-        raise _no_address(url, str(error)) from error
+    except ValueError:  # a port that is no number, half an IPv6 address
+        # Without the cause, whose text may be a part of a password.
+        raise _no_address(url, "its host or port can't be read") from None
     if not usable:
         raise _no_address(url, "no host, or characters that have to be quoted")
     if parts.username is not None or parts.password is not None:
         # Said without the address: it would print the password.
         raise ExpertError(
-            f"the address of an expert at {parts.hostname} holds a password",
+            f"the address of an expert at {shown(parts.hostname)} holds a password",
             "an address without: it is written into reports",
             "wrap the request in a function of your own",
         )
@@ -80,7 +83,7 @@ def _parse(url: str) -> SplitResult:
 
 def _no_address(url: str, reason: str) -> ExpertError:
     return ExpertError(
-        f"{url!r} is no address: {reason}",
+        f"{shown(without_secrets(url))!r} is no address: {reason}",
         "http://host:port/path",
         "write it like http://127.0.0.1:8000/act",
     )
@@ -90,10 +93,14 @@ class _Client:
     """The function that asks the server; it may be called by several threads at once."""
 
     def __init__(self, parts: SplitResult, action_size: int | None, timeout: float) -> None:
-        self.name = parts._replace(query="", fragment="").geturl()
+        self.name = without_secrets(parts.geturl())
+        self._arguments = parts, action_size, timeout
         self._parts, self._action_size, self._timeout = parts, action_size, timeout
         self._target = (parts.path or "/") + (f"?{parts.query}" if parts.query else "")
         self._local = threading.local()
+
+    def __reduce__(self) -> tuple[type["_Client"], tuple[SplitResult, int | None, float]]:
+        return _Client, self._arguments  # with connections of its own, wherever it is sent
 
     def __call__(self, rows: np.ndarray) -> np.ndarray:
         body = json.dumps({"observations": rows.tolist()}, allow_nan=False).encode()
@@ -106,7 +113,7 @@ class _Client:
             except ExpertError:
                 raise
             except (ConnectionError, http.client.IncompleteRead) as error:
-                problem = f"{type(error).__name__}: {error}"
+                problem = f"{type(error).__name__}: {first_line(error)}"
                 continue
             except (OSError, http.client.HTTPException) as error:
                 raise self._unreachable(error) from error
@@ -121,23 +128,50 @@ class _Client:
 
     def _post(self, body: bytes, limit: int) -> tuple[http.client.HTTPResponse, bytes]:
         connection = self._connection()
-        used = connection.sock is not None
         end = time.monotonic() + self._timeout
         try:
-            try:
-                response = self._request(connection, body)
-            except ConnectionError:
-                if not used:
-                    raise
-                # The server has closed a connection that was idle, as it may at any time.
-                connection.close()
-                response = self._request(connection, body)
-            with response:
-                data = self._read(response, limit, end)
+            used = connection.sock is not None and self._is_quiet(connection)
+            with _Deadline(connection, end) as deadline:
+                try:
+                    response = self._request(connection, body, deadline)
+                except ConnectionError:
+                    if not used or deadline.over:
+                        raise
+                    # The server has closed a connection that was idle, as it may at any time.
+                    connection.close()
+                    response = self._request(connection, body, deadline)
+                with response:
+                    data = self._read(response, limit)
         except BaseException:  # whatever is still to come would be taken for the next answer
             connection.close()
             raise
         return response, data
+
+    def _is_quiet(self, connection: http.client.HTTPConnection) -> bool:
+        """Whether nothing came after the last answer; a connection that was ended is closed.
+
+        Raises:
+            ExpertError: If something came: then the last answer may not have been the last
+                request's.
+        """
+        connection.sock.setblocking(False)
+        try:
+            came = connection.sock.recv(1)
+        except (BlockingIOError, ssl.SSLWantReadError):
+            return True
+        except OSError:
+            came = b""
+        if came:
+            raise self._too_much()
+        connection.close()
+        return False
+
+    def _too_much(self) -> ExpertError:
+        return ExpertError(
+            f"{self.name} sent more than one answer to one request",
+            f"{_REPLY}, once",
+            "mend the server: which answer belongs to which observations can't be known",
+        )
 
     def _connection(self) -> http.client.HTTPConnection:
         """Return this thread's connection; it opens itself again once it is closed."""
@@ -153,18 +187,23 @@ class _Client:
         return self._local.connection
 
     def _request(
-        self, connection: http.client.HTTPConnection, body: bytes
+        self, connection: http.client.HTTPConnection, body: bytes, deadline: "_Deadline"
     ) -> http.client.HTTPResponse:
         headers = {"Content-Type": "application/json", "Accept": "application/json"}
+        if connection.sock is None:
+            connection.timeout = deadline.left()
+            connection.connect()
+        line: socket.socket = getattr(connection, "sock")  # noqa: B009 (for the type checker)
+        line.settimeout(deadline.left())
         connection.request("POST", self._target, body, headers)
         if hasattr(socket, "TCP_QUICKACK"):
             # Plain servers send headers and body apart, and the body only once the headers are
             # acknowledged: by default 40 ms later. Linux forgets the wish, so each request has it.
-            connection.sock.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
+            line.setsockopt(socket.IPPROTO_TCP, socket.TCP_QUICKACK, 1)
         return connection.getresponse()
 
-    def _read(self, response: http.client.HTTPResponse, limit: int, end: float) -> bytes:
-        """Read the answer, not more than `limit` bytes and not after `end`."""
+    def _read(self, response: http.client.HTTPResponse, limit: int) -> bytes:
+        """Read the answer, not more than `limit` bytes."""
         announced, data = response.length, bytearray()
         while announced is None or len(data) < announced:
             if max(len(data), announced or 0) > limit:
@@ -177,10 +216,10 @@ class _Client:
             if not part:
                 break
             data += part
-            if time.monotonic() > end:
-                raise TimeoutError("the answer did not end in time")
         if announced is not None and len(data) < announced:
             raise http.client.IncompleteRead(bytes(data), announced - len(data))
+        if announced is not None and _is_followed(response):
+            raise self._too_much()
         return bytes(data)
 
     def _unreachable(self, error: Exception) -> ExpertError:
@@ -191,7 +230,7 @@ class _Client:
                 "pass load_expert(..., timeout=60), or a smaller batch=",
             )
         return ExpertError(
-            f"{self.name} can't be asked: {type(error).__name__}: {error}",
+            f"{self.name} can't be asked: {type(error).__name__}: {first_line(error)}",
             f"a server that answers {_REQUEST}",
             "check the address, and whether it speaks http or https",
         )
@@ -227,9 +266,69 @@ def _status(response: http.client.HTTPResponse) -> str:
     return f"{response.status} {_line(response.reason)}".strip()
 
 
+def _is_followed(response: http.client.HTTPResponse) -> bool:
+    """Whether more than a whole answer was read from the connection."""
+    # The reader's buffer; the attribute is public in all but its type stubs.
+    reader = getattr(response, "fp", None)
+    left = getattr(reader, "peek", None)
+    if reader is None or left is None:
+        return False
+    raw = getattr(getattr(reader, "raw", None), "_sock", None)
+    if raw is None:
+        return False
+    raw.setblocking(False)  # a peek into an empty buffer would wait for the server
+    try:
+        return bool(left(1))
+    except OSError:
+        return False
+
+
+class _Deadline:
+    """The end of an exchange: at its time the connection is cut, whatever is waited for.
+
+    A timeout of a socket begins anew with every byte that comes.
+    """
+
+    def __init__(self, connection: http.client.HTTPConnection, end: float) -> None:
+        self._connection, self._end = connection, end
+        self._clock = threading.Timer(max(end - time.monotonic(), 0), self._cut)
+        self._clock.daemon = True
+        self.over = False
+
+    def left(self) -> float:
+        """Return the seconds that are left.
+
+        Raises:
+            TimeoutError: If none are.
+        """
+        seconds = self._end - time.monotonic()
+        if seconds <= 0:
+            raise TimeoutError("the exchange did not end in time")
+        return seconds
+
+    def __enter__(self) -> "_Deadline":
+        self._clock.start()
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        self._clock.cancel()
+        if self.over and not isinstance(error, ExpertError):
+            raise TimeoutError("the exchange did not end in time") from error
+
+    def _cut(self) -> None:
+        self.over, socket_ = True, self._connection.sock
+        if socket_ is not None:
+            with suppress(OSError):
+                socket_.shutdown(socket.SHUT_RDWR)
+
+
 def _line(text: str | bytes) -> str:
     """Return the beginning of what a server said as one line that a terminal can show."""
-    plain = text.decode("utf-8", "replace") if isinstance(text, bytes) else text
-    shown = "".join(c if c.isprintable() else " " for c in plain[:1000])
-    words = " ".join(shown.split())
+    plain = text[:4000].decode("utf-8", "replace") if isinstance(text, bytes) else text[:4000]
+    words = shown(" ".join(plain.split()))
     return words if len(words) <= 120 else f"{words[:120]} ..."
