@@ -151,6 +151,25 @@ FAULTS = {
         201: "observations in tiny or large units",
         202: "observations in float64 whose movement float32 rounds away",
     },
+    "files of others": {
+        124: "a lock that is a link or has a second name, names in an archive",
+        125: "a manifest that names files elsewhere, links inside a run's folder",
+        126: "an HDF5 file that reads other files, makes an environment or unpacks to gigabytes",
+        127: "a folder that is no run's, whatever its folders are called",
+        128: "a run of an older or newer format, or whose expert's file was moved",
+        129: "a picture that can't be drawn",
+        130: "a number that JSON does not have",
+        131: "an environment that can't be closed",
+        132: "saves and reads side by side",
+        133: "a working folder that changes, an export to what is no plain file",
+        134: "a result that is pickled",
+        135: "JSON that is none, too deep, or of other types",
+        136: "headers that claim more than there is",
+        137: "a named pipe or a device in place of a file",
+        138: "a system without what only Unix has",
+        139: "a file of ours or of others that was mutated at random",
+        140: "a file of the hub without a hash",
+    },
 }
 
 LEFT_OUT: dict[int, str] = {}

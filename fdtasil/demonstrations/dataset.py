@@ -20,7 +20,7 @@ from fdtasil.files.storage import is_written, verify
 from fdtasil.probes.answers import Answers
 from fdtasil.probes.source import Probes
 
-__all__ = ["Dataset", "DatasetLike", "check_dataset", "load_dataset"]
+__all__ = ["Dataset", "DatasetLike", "check_dataset", "check_shapes", "load_dataset"]
 
 _VERSION = 1
 
@@ -135,6 +135,26 @@ def check_dataset(dataset: Dataset) -> Dataset:
     Raises:
         SettingError: If it is empty, of shapes that do not go together, or not finite.
     """
+    arrays = check_shapes(dataset)
+    _check_bounds(dataset.low, dataset.high)
+    for name in ("observations", "actions", "taken", "displacements", "values", "rewards"):
+        if name in arrays and not np.isfinite(arrays[name]).all():
+            bad = np.flatnonzero([not np.isfinite(row).all() for row in arrays[name]])
+            raise SettingError(
+                f"demonstrations whose {name} are not finite in {len(bad)} of "
+                f"{len(arrays[name])} rows, the first of them row {bad[0]}",
+                "finite numbers",
+                "drop these rows, and find out what made them",
+            )
+    return dataset
+
+
+def check_shapes(dataset: Dataset) -> dict[str, np.ndarray]:
+    """Return the arrays of a dataset by name, which go together.
+
+    Raises:
+        SettingError: If it is empty, or of types or shapes that do not.
+    """
     states, answers = dataset.demonstrations, dataset.answers
     arrays = dict(vars(states)) | {"low": dataset.low, "high": dataset.high}
     shapes = {"observations": "Nn", "actions": "Nm", "taken": "Nm", "low": "m", "high": "m"}
@@ -160,17 +180,7 @@ def check_dataset(dataset: Dataset) -> Dataset:
             )
     if answers is not None:
         _check_numbers(answers)
-    _check_bounds(dataset.low, dataset.high)
-    for name in ("observations", "actions", "taken", "displacements", "values", "rewards"):
-        if name in arrays and not np.isfinite(arrays[name]).all():
-            bad = np.flatnonzero([not np.isfinite(row).all() for row in arrays[name]])
-            raise SettingError(
-                f"demonstrations whose {name} are not finite in {len(bad)} of "
-                f"{len(arrays[name])} rows, the first of them row {bad[0]}",
-                "finite numbers",
-                "drop these rows, and find out what made them",
-            )
-    return dataset
+    return arrays
 
 
 def _check_kind(name: str, array: object) -> None:

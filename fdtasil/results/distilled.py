@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from fdtasil.demonstrations.dataset import Dataset, check_dataset
+from fdtasil.demonstrations.dataset import Dataset, check_shapes
 from fdtasil.demonstrations.states import Demonstrations
 from fdtasil.errors import first_line, warn
 from fdtasil.experts.expert import rows_text
@@ -164,7 +164,8 @@ class Distilled:
         files = verify(folder)
         settings = unstamped(files[CONFIG], folder / CONFIG, older=True)
         report = _read_report(files["report.json"])
-        dataset = check_dataset(Dataset.from_bytes(files["demonstrations.npz"]))
+        dataset = Dataset.from_bytes(files["demonstrations.npz"])
+        check_shapes(dataset)
         evaluation = report["evaluation"]
         return cls(
             student=Student.from_bytes(files["student.safetensors"]),

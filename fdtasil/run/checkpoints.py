@@ -8,7 +8,7 @@ from typing import Any, Generic, TypeVar
 
 import numpy as np
 
-from fdtasil.demonstrations.dataset import Dataset, check_dataset
+from fdtasil.demonstrations.dataset import Dataset, check_shapes
 from fdtasil.files.arrays import array_from_bytes
 from fdtasil.files.border import reads
 from fdtasil.files.reading import from_json
@@ -119,7 +119,8 @@ def _write_collected(now: Collected) -> Files:
 def _read_collected(files: Files) -> Collected:
     about = from_json(files[_ABOUT])
     counts = {name: _count(about["counts"], name) for name in about["counts"]}
-    dataset = check_dataset(Dataset.from_bytes(files["demonstrations.npz"]))
+    dataset = Dataset.from_bytes(files["demonstrations.npz"])
+    check_shapes(dataset)
     return Collected(dataset, _count(about, "episodes"), Counter(counts))
 
 
