@@ -119,7 +119,7 @@ _HEARD: ContextVar[tuple[list[str], ...]] = ContextVar("heard", default=())
 
 
 def first_line(error: BaseException) -> str:
-    """Return the start of an error's message, for a message of ours; its type where it has none."""
+    """Return the start of an error's message, or its type, for a message of ours."""
     lines = _text(error).strip().splitlines() or [type(error).__name__]
     return shown(lines[0])
 

@@ -34,9 +34,10 @@ def check_expert(
         seed: Of three episodes of the expert, and three of random actions.
 
     Returns:
-        One finding for each check: opening, answers, determinism, batch independence, action
-        bounds, action scale, batch sizes, return (against that of random actions). `problem` is
-        None where the check is passed. An expert that can't answer has the first two at most.
+        One finding for each check: opening, answers, determinism, batch independence, large
+        batches (as many rows as are asked at once), action bounds, action scale, batch sizes,
+        return (against that of random actions). `problem` is None where the check is passed.
+        An expert that can't answer has the first two at most.
 
     Raises:
         EnvironmentFault: If the environment can't be used.
@@ -67,9 +68,9 @@ def check_student(
         seed: Of three episodes of the policy.
 
     Returns:
-        One finding for each check: opening, answers, determinism, batch independence, action
-        bounds, action scale, batch sizes, far states (a thousand times as far out), and of a
-        `Student` also export (the ONNX file agrees to 1e-5). `problem` is None where the check is
+        One finding for each check: opening, answers, determinism, batch independence, large
+        batches, action bounds, action scale, batch sizes, far states (a thousand times as far
+        out), and of a `Student` also export (the ONNX file agrees to 1e-5). `problem` is None where the check is
         passed.
 
     Raises:

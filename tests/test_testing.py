@@ -9,8 +9,8 @@ from test_gate import FAULTS
 from fdtasil.errors import ExpertError
 from fdtasil.testing import check_expert, check_student
 
-NAMES = ["opening", "answers", "determinism", "batch independence", "action bounds"]
-NAMES += ["action scale", "batch sizes"]
+NAMES = ["opening", "answers", "determinism", "batch independence", "large batches"]
+NAMES += ["action bounds", "action scale", "batch sizes"]
 
 
 def problems(findings):

@@ -35,6 +35,7 @@ def examine(
     *,
     force: bool,
     rows: int = 0,
+    largest: int = 0,
 ) -> Episodes:
     """Check an expert on first states, let it act, and check it on the states that it visited.
 
@@ -48,6 +49,7 @@ def examine(
         progress: Progress bars.
         force: Go on with a warning where it fails a check but answers.
         rows: That the whole run may ask for; a long wait for them is announced.
+        largest: Rows of the large batch that is asked too; see `large_batch`.
 
     Returns:
         Its episodes, which a student is compared with later.
@@ -56,7 +58,7 @@ def examine(
         ExpertError: If it fails a check.
         EnvironmentFault: If nothing can be learnt from its episodes.
     """
-    check_first(expert, pool, starts, force=force, rows=rows)
+    check_first(expert, pool, starts, force=force, rows=rows, largest=largest)
     with progress.bar("expert", "step", len(starts) * horizon) as bar:
         behaviour = follow(expert.policy("evaluate"))
         episodes = rollout(behaviour, pool, starts, horizon, on_step=bar.move)
@@ -66,7 +68,13 @@ def examine(
 
 
 def check_first(
-    expert: Expert, pool: EnvironmentPool, starts: list[int], *, force: bool, rows: int
+    expert: Expert,
+    pool: EnvironmentPool,
+    starts: list[int],
+    *,
+    force: bool,
+    rows: int,
+    largest: int = 0,
 ) -> None:
     """Check an expert on first states, before it acts; the arguments of `examine`.
 
@@ -76,7 +84,7 @@ def check_first(
     """
     check_repeats(pool, starts[0], force=force)
     first = first_observations(pool, [starts[e % len(starts)] for e in range(GATE_STATES)])
-    _announce(admit_expert(expert, first, pool.boxes, force=force), rows)
+    _announce(admit_expert(expert, first, pool.boxes, force=force, largest=largest), rows)
 
 
 def _announce(seconds: float, rows: int) -> None:

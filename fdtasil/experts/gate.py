@@ -10,7 +10,15 @@ from fdtasil.errors import ExpertError, FdtasilError, warn
 from fdtasil.experts.expert import Expert
 from fdtasil.rollouts.environments import Boxes
 
-__all__ = ["GATE_QUERIES", "GATE_STATES", "Finding", "admit_expert", "examine_expert"]
+__all__ = [
+    "GATE_QUERIES",
+    "GATE_STATES",
+    "Finding",
+    "admit_expert",
+    "compare_again",
+    "examine_expert",
+    "large_batch",
+]
 
 GATE_STATES = 16
 """States that the gate asks about, before and after the expert's first rollouts."""
@@ -37,24 +45,35 @@ class Finding:
     problem: FdtasilError | None
 
 
+def large_batch(rows: int, chunk: int) -> int:
+    """Return how many rows the gate asks at once, where so many will be asked in all.
+
+    Fewer than the rows of small batches are none: those have been asked.
+    """
+    most = min(rows, chunk)
+    return most if most > GATE_STATES else 0
+
+
 def examine_expert(expert: Expert, observations: np.ndarray, boxes: Boxes) -> list[Finding]:
     """Check an expert on real states without raising.
 
     Args:
-        expert: The expert; about three rows are asked for each observation.
+        expert: The expert; about three rows are asked for each observation, and one whole batch
+            of `expert.chunk` rows.
         observations: (B, n) float32 states of the environment, B at least 2; 32 are plenty.
         boxes: The environment's spaces.
 
     Returns:
         One finding for each check, in the order: answers (shape and finiteness), determinism,
-        batch independence, action bounds, action scale. An expert that can't answer has the
-        first finding only.
+        batch independence, large batches, action bounds, action scale. An expert that can't
+        answer has the first finding only.
     """
-    return _examine(expert, observations, boxes)[0]
+    largest = large_batch(expert.chunk, expert.chunk)
+    return _examine(expert, observations, boxes, largest)[0]
 
 
 def _examine(
-    expert: Expert, observations: np.ndarray, boxes: Boxes
+    expert: Expert, observations: np.ndarray, boxes: Boxes, largest: int
 ) -> tuple[list[Finding], float]:
     """Return the findings, and the seconds that a row takes."""
     times = [time.perf_counter()]
@@ -67,21 +86,28 @@ def _examine(
         times.append(time.perf_counter())
     except ExpertError as error:
         return [Finding("answers", error.found, error)], 0.0
+    seconds = float(np.diff(times).min()) / len(observations)
     probe = _Answers(expert, observations, answers, boxes)
     found = Finding("answers", f"{answers.shape[1]} finite numbers for each observation", None)
     findings = [
         found,
         probe.same(again, "determinism", "asked twice", _STOCHASTIC),
         probe.same(alone, "batch independence", "asked alone and in a batch", _BATCH_DEPENDENT),
+        probe.in_large_batches(largest),
         probe.within_bounds(),
         probe.fills_bounds(),
     ]
     # The first query may start workers, and any may meet a busy machine: the quickest counts.
-    return findings, float(np.diff(times).min()) / len(observations)
+    return findings, seconds
 
 
 def admit_expert(
-    expert: Expert, observations: np.ndarray, boxes: Boxes, *, force: bool = False
+    expert: Expert,
+    observations: np.ndarray,
+    boxes: Boxes,
+    *,
+    force: bool = False,
+    largest: int = 0,
 ) -> float:
     """Check an expert on real states, and raise what is wrong with it.
 
@@ -90,6 +116,7 @@ def admit_expert(
         observations: (B, n) float32 states of the environment, B at least 2.
         boxes: The environment's spaces.
         force: Warn instead of raising, where the expert answers at all.
+        largest: Rows of the large batch that is asked too; see `large_batch`.
 
     Returns:
         Seconds that a row takes, in such a batch or alone.
@@ -97,9 +124,43 @@ def admit_expert(
     Raises:
         ExpertError: The first problem found.
     """
-    findings, seconds = _examine(expert, observations, boxes)
+    findings, seconds = _examine(expert, observations, boxes, largest)
     raise_problems(findings, force=force)
     return seconds
+
+
+def compare_again(expert: Expert, observations: np.ndarray, answers: np.ndarray) -> None:
+    """Ask an expert again at the end of a run, and warn where it answers otherwise than before.
+
+    It is no error: what was trained would be lost by it.
+
+    Args:
+        expert: The expert.
+        observations: (N, n) states of the run.
+        answers: (N, m) what it answered there.
+    """
+    chosen = np.linspace(0, len(observations) - 1, GATE_STATES).round().astype(int)
+    before = answers[chosen]
+    try:
+        now = expert.ask(observations[chosen], "check")
+    except ExpertError as error:
+        warn(f"asked again at the end of the run, the expert failed: {error.found}")
+        return
+    difference = float(np.abs(now - before).max())
+    spread = max(1.0, float(np.abs(answers).max()))
+    if difference <= _SAME * spread:
+        return
+    usual = float(np.abs(before - before.mean(axis=0)).max())
+    other = (
+        "altogether other actions, so do not rely on this student: "
+        if (difference > max(usual, _SAME * spread))
+        else ""
+    )
+    warn(
+        f"{expert.name} has changed during the run: asked again at {GATE_STATES} states, its "
+        f"answers differ by up to {difference:.2g} from those at the beginning; {other}"
+        "look for memory, noise or a clock in it, or for a server whose model was replaced"
+    )
 
 
 def raise_problems(findings: Sequence[Finding], *, force: bool) -> None:
@@ -113,8 +174,13 @@ def raise_problems(findings: Sequence[Finding], *, force: bool) -> None:
 
 
 _STOCHASTIC = (
-    "equal answers to equal observations",
-    "export the deterministic policy (its mean), or pass force=True to clone the noise as well",
+    "equal answers to equal observations, without noise, and without memory of earlier ones",
+    "export the deterministic policy (its mean), without a hidden state; or pass force=True "
+    "(--force on the command line) to go on as it is",
+)
+_LARGE = (
+    "the same answers in batches of any size",
+    "mend what depends on the size, or write load_expert(..., batch={})",
 )
 _BATCH_DEPENDENT = (
     "an answer that depends on its own row only",
@@ -139,6 +205,30 @@ class _Answers:
         found = f"{self.expert.name} {how} differs by up to {difference:.2g}"
         return Finding(name, measured, ExpertError(found, *advice))
 
+    def in_large_batches(self, rows: int) -> Finding:
+        """Ask as many rows at once as probes will be; the states are few, and are repeated."""
+        name = "large batches"
+        if not rows:
+            return Finding(name, "none are asked", None)
+        repeats = -(-rows // len(self.observations))
+        advice = _LARGE[0], _LARGE[1].format(len(self.observations))
+        try:
+            many = np.tile(self.observations, (repeats, 1))[:rows]
+            answers = self.expert.ask(many, "check")
+        except ExpertError as error:
+            # Named so that nothing can force it: the probes would meet it after hours.
+            return Finding("answers", error.found, ExpertError(error.found, *advice))
+        difference = np.abs(answers - np.tile(self.answers, (repeats, 1))[:rows]).max(axis=1)
+        wrong = int((difference > _SAME * self._range()).sum())
+        measured = f"{rows:,} rows at once: largest difference {difference.max():.1e}"
+        if not wrong:
+            return Finding(name, measured, None)
+        found = (
+            f"{self.expert.name} answers {wrong:,} of {rows:,} observations at once otherwise "
+            f"than few, by up to {difference.max():.2g}"
+        )
+        return Finding(name, measured, ExpertError(found, *advice))
+
     def within_bounds(self) -> Finding:
         low, high = self.boxes.low, self.boxes.high
         beyond = np.maximum(self.answers - high, low - self.answers)
@@ -153,8 +243,8 @@ class _Answers:
         problem = ExpertError(
             found,
             f"actions from {_numbers(low)} to {_numbers(high)}",
-            "put scaling and clipping inside the expert, or pass force=True to let the "
-            "environment clip",
+            "put scaling and clipping inside the expert, or pass force=True (--force on the "
+            "command line) to let the environment clip",
         )
         return Finding("action bounds", measured, problem)
 

@@ -92,6 +92,7 @@ class Arguments:
             device=self.device,
             evaluation_episodes=self.evaluation_episodes if subject.comparable else 0,
             max_queries=self.max_queries,
+            batch=expert.chunk if expert else 0,
             fingerprint=fingerprint(subject.pool, start) if subject.pool else None,
         )
 

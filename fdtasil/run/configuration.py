@@ -1,13 +1,14 @@
 """A run's resolved configuration: every choice made, in one frozen place."""
 
 import json
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
 from fdtasil.demonstrations.trainers import Trainer, describe_trainer
 from fdtasil.errors import SettingError
 from fdtasil.experts.expert import rows_text
-from fdtasil.experts.gate import GATE_QUERIES
+from fdtasil.experts.gate import GATE_QUERIES, GATE_STATES, large_batch
 from fdtasil.probes.calibration import Ladder, ladder_for
 from fdtasil.probes.source import Probes
 from fdtasil.student.architectures import Architecture, describe
@@ -41,6 +42,7 @@ class Configuration:
         device: Where the student is trained.
         evaluation_episodes: Paired episodes of the evaluation; 0 where nothing is compared.
         max_queries: The most that the expert may be asked, or None.
+        batch: Rows that the expert is asked at once, at most.
         fingerprint: Of the environment; see `rollouts/trials.py`. None where there is none, or it
             does not repeat itself.
     """
@@ -65,6 +67,7 @@ class Configuration:
     device: str
     evaluation_episodes: int
     max_queries: int | None
+    batch: int
     fingerprint: dict[str, Any] | None
 
     def predicted_queries(self) -> dict[str, int]:
@@ -76,16 +79,28 @@ class Configuration:
         """
         purposes = ("check", "act", "label", "calibrate", "probe", "evaluate")
         found: dict[str, int] = dict.fromkeys(purposes, 0)
-        if self.expert is not None and self.horizon:
-            gates = 2 if self.evaluation_episodes else 1
-            found["check"] = gates * GATE_QUERIES
-            found["evaluate"] = 2 * self.evaluation_episodes * self.horizon
         if self.trainer is not None:
             found |= self.trainer.queries(self.episodes, self.horizon)
         if self.probes is not None and not self.probes_given:
             found["probe"] = self._predicted_probes(self.probes)
             found["calibrate"] = self.ladder.queries if self.calibrated else 0
+        if self.expert is not None and self.horizon:
+            gates = 2 if self.evaluation_episodes else 1
+            again = GATE_STATES if self.evaluation_episodes or self.trainer is not None else 0
+            found["check"] = gates * GATE_QUERIES + self._largest_batch(found) + again
+            found["evaluate"] = 2 * self.evaluation_episodes * self.horizon
         return found
+
+    @property
+    def largest_batch(self) -> int:
+        """Rows of the large batch that the gate asks, 0 for none."""
+        return self._largest_batch(self.predicted_queries())
+
+    def _largest_batch(self, queries: Mapping[str, int]) -> int:
+        # Episodes are asked side by side, one row each; the rest all at once.
+        together = [queries[purpose] for purpose in ("label", "calibrate", "probe")]
+        rows = max(*together, self.episodes, self.evaluation_episodes)
+        return large_batch(rows, self.batch)
 
     @property
     def order(self) -> int:

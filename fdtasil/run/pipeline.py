@@ -11,8 +11,8 @@ from fdtasil.demonstrations.dataset import Dataset, DatasetLike, load_dataset
 from fdtasil.demonstrations.trainers import Trainer
 from fdtasil.errors import SettingError, heard_warnings
 from fdtasil.experts.examination import check_first, examine
-from fdtasil.experts.expert import Hints
-from fdtasil.experts.gate import GATE_STATES
+from fdtasil.experts.expert import Expert, Hints
+from fdtasil.experts.gate import GATE_STATES, compare_again, large_batch
 from fdtasil.experts.load import ExpertLike, load_expert, open_expert, sized
 from fdtasil.probes.source import Probes
 from fdtasil.progress import Progress
@@ -29,6 +29,7 @@ from fdtasil.run.configuration import Configuration
 from fdtasil.run.events import Callback, Event, tell_all
 from fdtasil.run.folder import open_run_folder
 from fdtasil.run.interrupts import heard_interrupts
+from fdtasil.run.lesson import Lesson
 from fdtasil.run.report import config_of, report_of
 from fdtasil.run.rounds import Rounds
 from fdtasil.run.subject import Subject, open_subject
@@ -222,7 +223,8 @@ def evaluate(
         black_box, length = load_expert(expert, n, m), resolve_horizon(horizon, pool)
         judged = open_expert(policy, Hints(n if student_obs is None else None, m))
         starts = episode_seeds(seed, "evaluation", 0, count)
-        theirs = examine(black_box, pool, starts, length, bars, force=force)
+        most = large_batch(count, black_box.chunk)
+        theirs = examine(black_box, pool, starts, length, bars, force=force, largest=most)
         seen = judged.columns if student_obs is None else student_obs
         view = View.of(seen, theirs.observations[theirs.valid][:256])
         answer = view.policy(sized(judged, view.size, m).policy("evaluate"))
@@ -275,6 +277,7 @@ def _complete(
             )
             about = int(last["round"]), trained.steps, last
             rounds.training.callback(Event("evaluation", *about, student, evaluation))
+        _ask_again(run, subject.expert, theirs, lesson)
     report = report_of(
         run,
         evaluation,
@@ -304,7 +307,21 @@ def _examined(rounds: Rounds, subject: Subject, *, force: bool) -> Episodes | No
     starts = episode_seeds(run.seed, "evaluation", 0, run.evaluation_episodes or GATE_STATES)
     rows = sum(run.predicted_queries().values())
     if not run.evaluation_episodes:
-        check_first(expert, pool, starts, force=force, rows=rows)
+        check_first(expert, pool, starts, force=force, rows=rows, largest=run.largest_batch)
         return None
-    bars = rounds.training.progress
-    return examine(expert, pool, starts, run.horizon, bars, force=force, rows=rows)
+    bars, most = rounds.training.progress, run.largest_batch
+    return examine(expert, pool, starts, run.horizon, bars, force=force, rows=rows, largest=most)
+
+
+def _ask_again(
+    run: Configuration, expert: Expert | None, theirs: Episodes | None, lesson: Lesson
+) -> None:
+    """Warn of an expert that answers otherwise than at the beginning."""
+    if expert is None or not run.horizon:
+        return
+    if theirs is not None:
+        valid = theirs.valid
+        compare_again(expert, theirs.observations[valid], theirs.actions[valid])
+    elif run.trainer is not None:
+        states = lesson.collected.dataset.demonstrations
+        compare_again(expert, states.observations, states.actions)

@@ -51,10 +51,10 @@ def report_of(
     """
     plain, account = run.to_json(), checkpoints.account
     source, calibration = checkpoints.asking.source, checkpoints.asking.calibration
-    # The ladder was chosen before it was known what it finds.
-    predicted = replace(run, probes=source).predicted_queries() | {
-        "calibrate": run.predicted_queries()["calibrate"]
-    }
+    # The ladder, and the gate's batch, were chosen before it was known what the ladder finds.
+    before = run.predicted_queries()
+    chosen = {purpose: before[purpose] for purpose in ("calibrate", "check")}
+    predicted = replace(run, probes=source).predicted_queries() | chosen
     counts = ("clipped_actions", "physics_resets", "terminated_episodes")
     return {
         "expert": {
