@@ -70,8 +70,8 @@ def check_student(
     Returns:
         One finding for each check: opening, answers, determinism, batch independence, large
         batches, action bounds, action scale, batch sizes, far states (a thousand times as far
-        out), and of a `Student` also export (the ONNX file agrees to 1e-5). `problem` is None where the check is
-        passed.
+        out), and of a `Student` also export (the ONNX file agrees to 1e-5). `problem` is None
+        where the check is passed.
 
     Raises:
         EnvironmentFault: If the environment can't be used.

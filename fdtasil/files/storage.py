@@ -57,10 +57,11 @@ def to_json(value: Any) -> bytes:
     return (json.dumps(value, indent=2, allow_nan=False) + "\n").encode()
 
 
-def write_bytes(path: Path, data: bytes) -> None:
+def write_bytes(path: Path, data: bytes, *, private: bool = False) -> None:
     """Write a whole file or nothing.
 
-    Where `path` is a link, what it leads to is written; a device is written through.
+    Where `path` is a link, what it leads to is written; a device is written through. Nobody but
+    its owner may read a file that is `private`.
 
     Raises:
         StorageError: If the disk is full, the folder is read-only, `path` is a folder, a pipe or
@@ -72,7 +73,7 @@ def write_bytes(path: Path, data: bytes) -> None:
     if _kind(path) == stat.S_IFCHR:
         _write_through(path, data)
         return
-    _write(path, data)
+    _write(path, data, private=private)
     _flush_names(path.parent)
 
 
@@ -276,7 +277,7 @@ def remove_if_empty(folder: Path) -> None:
         folder.rmdir()
 
 
-def _write(path: Path, data: bytes) -> None:
+def _write(path: Path, data: bytes, *, private: bool = False) -> None:
     """Write a file of which a power failure may still lose the name."""
     if (kind := _kind(path)) not in (None, stat.S_IFREG):
         what = {stat.S_IFDIR: "a folder", stat.S_IFLNK: "a link"}.get(kind, "no plain file")
@@ -287,7 +288,8 @@ def _write(path: Path, data: bytes) -> None:
     temporary = path.with_name(f".{path.name}.{os.getpid()}.{secrets.token_hex(4)}.tmp")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        with temporary.open("xb") as file:
+        mode = 0o600 if private else 0o666
+        with open(temporary, "xb", opener=lambda name, flags: os.open(name, flags, mode)) as file:
             file.write(data)
             file.flush()
             os.fsync(file.fileno())

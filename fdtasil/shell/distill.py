@@ -7,7 +7,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from fdtasil.errors import SettingError, StorageError, shown
+from fdtasil.errors import SettingError, StorageError, shown, without_secrets
 from fdtasil.experts.expert import rows_text
 from fdtasil.experts.load import load_expert
 from fdtasil.files.border import reads
@@ -79,7 +79,10 @@ def _remembering(arguments: dict[str, Any], folder: Path) -> Iterator[None]:
     plain = {k: str(v) if isinstance(v, Path) else v for k, v in arguments.items()}
     with locked(folder):  # another run's arguments stay its own
         before = read_plain(path, _LIMIT, follow=False) if path.exists() else None
-        write_bytes(path, stamped(plain))
+        expert = plain["expert"] or ""
+        # An address may hold a key, and a run that goes on needs it.
+        secret = without_secrets(expert) != expert
+        write_bytes(path, stamped(plain), private=secret)
     try:
         yield
     except BaseException:
@@ -160,9 +163,9 @@ def _side_by_side(result: Distilled, cloning: Evaluation | None) -> str:
     """Return a table of expert, plain cloning and student."""
     ours = result.evaluation
     if ours is None:
-        return f"{result.report['env']}: trained without an evaluation"
+        return f"{shown(result.report['env'])}: trained without an evaluation"
     lines = [
-        f"{result.report['env']}, {ours.episodes} paired episodes of {ours.horizon} steps",
+        f"{shown(result.report['env'])}, {ours.episodes} paired episodes of {ours.horizon} steps",
         f"{'':15}{'return':>10}{'normalised':>12}{'95 % interval':>18}{'survival':>10}",
         f"{'expert':15}{ours.expert_return:10.1f}{1:12.3f}{'':18}{ours.expert_survival:10.2f}",
     ]

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Literal
 
 from fdtasil.checks import check_count
+from fdtasil.errors import printable, without_secrets
 from fdtasil.experts.examination import Looked, look_closely
 from fdtasil.files.storage import write_bytes
 from fdtasil.probes.calibration import Calibration, calibrate
@@ -53,7 +54,11 @@ def command(
     assert source is not None
     with EnvironmentPool(env) as pool:
         looked = look_closely(source, pool, horizon, seed, episodes)
-        rows = [("expert", expert), ("environment", pool.name), *_contract(looked, pool)]
+        rows = [
+            ("expert", without_secrets(expert)),
+            ("environment", pool.name),
+            *_contract(looked, pool),
+        ]
     problem = next((finding.problem for finding in looked.findings if finding.problem), None)
     found = _calibrated(looked, seed)
     if found is not None:
@@ -63,7 +68,7 @@ def command(
             ("suggested radius", f"{found.radius:.2g} deviations, {found.stencil} stencil"),
         ]
     rows += _returns(looked)
-    print("\n".join(f"{name:20}{value}" for name, value in rows))
+    print("\n".join(printable(f"{name:20}{value}") for name, value in rows))
     if file is not None and found is not None:
         write_bytes(file, draw_calibration(found))
         print(f"{'picture':20}{picture}")

@@ -12,6 +12,7 @@ from fdtasil.errors import ExpertError, SettingError
 from fdtasil.experts.sb3.agent import Agent, read_agent
 from fdtasil.experts.sb3.statistics import VecNormalizePath
 from fdtasil.experts.sb3.trust import Trust
+from fdtasil.experts.sizes import size_hint
 from fdtasil.files.onnx.export import export_module
 from fdtasil.files.storage import write_bytes
 from fdtasil.rollouts.behaviours import follow
@@ -112,7 +113,9 @@ def _check_fit(agent: Agent, pool: EnvironmentPool) -> None:
         raise ExpertError(
             f"{agent.source} has {found[0]} observations and {found[1]} actions",
             f"{expected[0]} and {expected[1]}, as {pool.name}",
-            "check the environment's version, options and wrappers (Ant-v4 gives 27, Ant-v5 105)",
+            size_hint(found[0], expected[0])
+            if found[0] != expected[0]
+            else "check the environment's version, options and wrappers",
         )
     pairs = ((agent.action_low, boxes.low), (agent.action_high, boxes.high))
     if not all(np.allclose(ours, theirs, rtol=1e-5) for ours, theirs in pairs):

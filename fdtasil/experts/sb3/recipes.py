@@ -10,7 +10,14 @@ from torch import nn
 from fdtasil.errors import ExpertError, shown
 from fdtasil.experts.sb3.trust import TRUST
 
-__all__ = ["Recipe", "check_policy", "find_recipe", "has_usual_policy", "read_activation"]
+__all__ = [
+    "FLATTENED",
+    "Recipe",
+    "check_policy",
+    "find_recipe",
+    "has_usual_policy",
+    "read_activation",
+]
 
 _ITSELF = "load it with its own library, and pass the agent itself: distill(agent, env)"
 
@@ -112,12 +119,17 @@ _HARMLESS = {
     *("ortho_init", "sde_net_arch", "share_features_extractor", "use_expln"),
 }
 # Policies that are not read, trusted or not, and what to do instead.
+FLATTENED = (
+    "wrap the environment in FlattenObservation, and pass a function: lambda rows: np.stack(["
+    "agent.predict(gymnasium.spaces.unflatten(agent.observation_space, row), deterministic=True)[0] "
+    "for row in rows])"
+)
 _TRAIN = "choose or train such an agent; fdtasil distils no other"
 _UNFIT = {
     r"(stable_baselines3|sb3_contrib)\..*Cnn": ("a policy on images", _TRAIN),
     r"(stable_baselines3|sb3_contrib)\..*MultiInput": (
         "a policy on dictionaries of observations",
-        _TRAIN,
+        FLATTENED,
     ),
     r"sb3_contrib\..*recurrent": ("a policy with memory", _TRAIN),
     r"sbx\.": ("a policy of sbx, whose weights are JAX's", _ITSELF),

@@ -1,5 +1,6 @@
 """The VecNormalize statistics that an agent was trained with: found, read with trust, checked."""
 
+import shlex
 from collections.abc import Collection
 from fnmatch import fnmatchcase
 from pathlib import Path, PurePath
@@ -70,11 +71,12 @@ def _check_neighbours(agent: Path) -> None:
     if not found:
         return
     more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
-    command = f"fdtasil export-sb3 {agent} --out {agent.stem}.onnx --vecnormalize"
+    named, out, file = (shlex.quote(str(part)) for part in (agent, f"{agent.stem}.onnx", found[0]))
+    command = f"fdtasil export-sb3 {named} --out {out} --vecnormalize"
     raise ExpertError(
         f"{found[0]}{more} lies beside {agent.name} and looks like its observation statistics",
-        f'vecnormalize="{found[0]}" and trust="pickle", or vecnormalize=False',
-        f"{command} {found[0]} --trust pickle (or --vecnormalize False), then use the ONNX file",
+        "one ONNX file of both, or the word that the agent was trained without them",
+        f"{command} {file} --trust pickle (or --vecnormalize False), then use the ONNX file",
     )
 
 

@@ -1,5 +1,7 @@
 """Reading an ONNX file with its weights: nothing outside its folder, no code of it is run."""
 
+import io
+import zipfile
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -21,11 +23,25 @@ _IMPOSTORS = {
     b"<": ("an HTML or XML page", "download the file itself, not the page about it"),
     b"version https://git-lfs": ("a git-LFS pointer", "run `git lfs pull`"),
     b"\x80": ("a Python pickle", "export the controller to ONNX; pickles are never opened"),
-    b"PK\x03\x04": (
-        "a zip; if stable-baselines3 wrote it, it is an agent and not a model",
+    b"\x89HDF": ("an HDF5 file, as Keras writes", "load it with its own library, and wrap it"),
+    b"\x1f\x8b": ("compressed by gzip", "unpack it first: gunzip"),
+    b"{": ("a JSON text", "name the model itself"),
+}
+# What a zip is, by how one of its members is called.
+_ZIPS = {
+    "constants.pkl": ("a TorchScript file", "pass the module: torch.jit.load({path!r})"),
+    "data.pkl": (
+        "a file of torch.save, which is a pickle",
+        "load it in your own code with torch.load, and pass the module",
+    ),
+    "policy.pth": (
+        "the zip of a stable-baselines3 agent",
         "name it *.zip, or export it with `fdtasil export-sb3`",
     ),
+    ".npy": ("an archive of numpy arrays", "pass demonstrations as dataset=, not as the expert"),
+    ".weights.h5": ("a Keras file", "load it with its own library, and wrap it in a function"),
 }
+_ANY_ZIP = ("a zip", "unpack it, and name the ONNX file inside")
 
 
 def read_model(path: Path) -> "tuple[onnx.ModelProto, str]":
@@ -47,6 +63,9 @@ def read_model(path: Path) -> "tuple[onnx.ModelProto, str]":
     for magic, (found, next_step) in _IMPOSTORS.items():
         if data.startswith(magic):
             raise ExpertError(f"{path} is {found}", "an ONNX model", next_step)
+    if data.startswith(b"PK\x03\x04"):
+        found, next_step = _kind_of_zip(data)
+        raise ExpertError(f"{path} is {found}", "an ONNX model", next_step.format(path=str(path)))
     model = None
     try:
         model = onnx.load_model_from_string(data)
@@ -62,6 +81,19 @@ def read_model(path: Path) -> "tuple[onnx.ModelProto, str]":
             "copy or export it again",
         )
     return model, sha256(data)
+
+
+def _kind_of_zip(data: bytes) -> tuple[str, str]:
+    """Return what a zip is, and the next step, by its members' names; nothing is unpacked."""
+    try:
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            names = archive.namelist()[:1000]
+    except Exception:  # damaged bytes may raise anything
+        return "a zip that was cut short", "copy or download it again"
+    for end, kind in _ZIPS.items():
+        if any(name.endswith(end) for name in names):
+            return kind
+    return _ANY_ZIP
 
 
 def side_files(data: bytes) -> set[str]:
