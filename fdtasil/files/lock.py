@@ -42,7 +42,7 @@ def locked(folder: Path, patience: float = 0.0) -> Iterator[None]:
         StorageError: If another process has it, or it can't be written.
     """
     path = inside(folder, LOCK)
-    made = not folder.exists()
+    made = not os.path.exists(folder)  # Path's own raises where a name is too long
     file = _wait_for(path, time.monotonic() + patience)
     try:
         yield

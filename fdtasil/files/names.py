@@ -58,7 +58,8 @@ def check_no_links(folder: Path) -> None:
 
 def _is_link(path: Path) -> bool:
     is_junction = getattr(os.path, "isjunction", None)  # Windows, and Python 3.12
-    return path.is_symlink() or (is_junction is not None and is_junction(path))
+    # os.path's: Path's own raises where a name is too long.
+    return os.path.islink(path) or (is_junction is not None and is_junction(path))
 
 
 def _refused(path: Path) -> StorageError:

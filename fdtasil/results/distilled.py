@@ -215,13 +215,13 @@ def write_run(result: Distilled, folder: Path) -> None:
         "progress.csv": _csv(result.history),
         "demonstrations.npz": result.dataset.to_bytes(),
         "student.safetensors": result.export_bytes("student.safetensors"),
+        **_attempted({"student.onnx": lambda: result.export_bytes("student.onnx")}, notes),
         "report.json": _with_notes(report, notes),
     }
     write_folder(folder, core)
     said = len(notes)
-    extra = _attempted({"student.onnx": lambda: result.export_bytes("student.onnx")}, notes)
     drawn = {f"figures/{name}.png": _drawing(draw, result) for name, draw in FIGURES.items()}
-    extra |= _attempted(drawn, notes)
+    extra = _attempted(drawn, notes)
     if len(notes) > said:
         extra["report.json"] = _with_notes(report, notes)
     if extra:

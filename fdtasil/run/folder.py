@@ -1,5 +1,6 @@
 """A run's folder while the run goes on: its configuration, its checkpoints, and going on."""
 
+import os
 import re
 import time
 from collections.abc import Callable, Iterator
@@ -158,12 +159,12 @@ def _drop(folder: Path) -> None:
 def _read_config(path: Path) -> dict[str, Any]:
     """Return the configuration of the run in a folder, the unfinished one if there are two."""
     unfinished = inside(path, f"{CHECKPOINTS}/{CONFIG}")
-    config = unfinished if unfinished.exists() else inside(path, CONFIG)
+    config = unfinished if os.path.exists(unfinished) else inside(path, CONFIG)
     try:
         return unstamped(
             read_plain(config, _CONFIG_LIMIT, follow=False),
             config,
-            older=not (path / CHECKPOINTS).exists(),
+            older=not os.path.exists(path / CHECKPOINTS),
         )
     except StorageError:
         raise

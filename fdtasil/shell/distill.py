@@ -1,6 +1,7 @@
 """`fdtasil distill`: a run from a shell, with a baseline beside it, and gone on with."""
 
 import inspect
+import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -71,7 +72,7 @@ def _remembering(arguments: dict[str, Any], folder: Path) -> Iterator[None]:
     """Keep the arguments of a run beside it, for `--resume`; not those of one that never began."""
     check_free(folder)
     checkpoints, path = inside(folder, CHECKPOINTS), inside(folder, COMMAND)
-    if checkpoints.exists():  # of another run, which is refused in a moment
+    if os.path.exists(checkpoints):  # of another run, which is refused in a moment
         yield
         return
     if is_written(folder):
