@@ -223,7 +223,7 @@ class Command(Reader):
         from fdtasil.shell.distill import _remembered
 
         (self.place / "command.json").write_bytes(mutated_json(self.data, random))
-        arguments = {**_remembered(self.place), "out": None, "max_queries": 1}
+        arguments = {**_remembered(self.place), "out": None, "resume": None, "max_queries": 1}
         if random.integers(4) == 0:
             distil(arguments, progress=False)  # asks too much: refused before anything is done
 
