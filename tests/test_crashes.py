@@ -217,11 +217,9 @@ class FailingWrites:
 
     def _wrap(self, real, method):
         def call(*arguments, **named):
-            reading = method == "open" and (arguments[1:2] or ("r",))[0] in (
-                "r",
-                "rb",
-                os.O_RDONLY,
-            )
+            how = (arguments[1:2] or ("r",))[0] if method == "open" else "w"
+            writing = os.O_WRONLY | os.O_RDWR | os.O_CREAT
+            reading = how in ("r", "rb") if isinstance(how, str) else not how & writing
             if reading:
                 return real(*arguments, **named)
             self.count += 1
