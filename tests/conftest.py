@@ -177,7 +177,7 @@ def no_pictures():
 
 @pytest.fixture
 def many_checkpoints(monkeypatch):
-    """One of so many moments at which a checkpoint may be taken is used, whatever the time.
+    """Every 25th moment at which a checkpoint may be taken is used, whatever the time.
 
     An odd number: a training goes on after odd and after even steps then.
     """
@@ -185,7 +185,7 @@ def many_checkpoints(monkeypatch):
 
     def due(folder):
         asked[id(folder)] += 1
-        return folder._path is not None and asked[id(folder)] % 21 == 0
+        return folder._path is not None and asked[id(folder)] % 25 == 0
 
     monkeypatch.setattr(RunFolder, "due", property(due))
 

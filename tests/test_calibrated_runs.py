@@ -10,6 +10,8 @@ from conftest import GAIN, QUICK, TOY
 import fdtasil
 from fdtasil.errors import FdtasilWarning, SettingError
 
+pytestmark = pytest.mark.usefixtures("no_pictures")
+
 EXPERTS = {
     "smooth": lambda x: np.tanh(x @ GAIN.T),
     "steps": lambda x: np.round(20 * (x @ GAIN.T) % 1) / 2,

@@ -119,9 +119,9 @@ def test_every_argument_is_explained(name, inside, monkeypatch):
 # --- what commands do
 
 
-def test_inspect_distill_evaluate(expert, tmp_path):
-    """In processes of their own, as a user has them."""
-    shown = shell("inspect", expert, TOY, "--episodes", 2)
+def test_inspect_distill_evaluate(expert, inside, tmp_path):
+    """The middle one in a process of its own, as a user has it, and a baseline beside it."""
+    shown = inside("inspect", expert, TOY, "--episodes", 2)
     assert shown.returncode == 0, shown.stderr
     for promised in ("sha256", "determinism", "batch independence", "action bounds", "return"):
         assert promised in shown.stdout
@@ -133,7 +133,7 @@ def test_inspect_distill_evaluate(expert, tmp_path):
     report = json.loads((tmp_path / "run" / "report.json").read_text())
     assert report["queries"]["probe"] == 400
     assert (tmp_path / "run" / "figures" / "training.png").read_bytes().startswith(b"\x89PNG")
-    judged = shell("evaluate", tmp_path / "run" / "student.onnx", TOY, "--expert", expert)
+    judged = inside("evaluate", tmp_path / "run" / "student.onnx", TOY, "--expert", expert)
     assert judged.returncode == 0, judged.stderr
     assert "normalised return" in judged.stdout
 

@@ -17,7 +17,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import QUICK, TOY, mlp_onnx
-from test_resume import FILES, RUN, Stop, read, stop_at
+from test_resume import FILES, Stop, read, stop_at
+from test_resume import RUN as SHORTER
 
 import fdtasil
 from fdtasil import Fit
@@ -27,6 +28,7 @@ from fdtasil.run import folder as runfolder
 
 pytestmark = pytest.mark.usefixtures("no_pictures")
 
+RUN = {**SHORTER, "fit": Fit(steps=150)}
 SHORT = {**QUICK, "probes": 2, "fit": Fit(steps=3)}
 
 # Forks a run for each line it reads: the imports, which take seconds, are done once.
@@ -57,8 +59,8 @@ for line in sys.stdin:
             traceback.print_exc()
             code = 1
         os._exit(code)
-    print(child, flush=True)
-    print(os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
+    print("begun", child, flush=True)
+    print("ended", os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
 """
 
 
@@ -78,11 +80,21 @@ class Nursery:
         order = {"expert": str(expert), "env": TOY, **arguments}
         self._process.stdin.write(pickle.dumps(order).hex() + "\n")
         self._process.stdin.flush()
-        return int(self._process.stdout.readline())
+        return self._told("begun")
 
     def end(self):
         """Wait for the run's end; return its exit code, negative for a signal."""
-        return int(self._process.stdout.readline())
+        return self._told("ended")
+
+    def _told(self, what):
+        """Return what is told next of that kind: a test that failed may not have waited.
+
+        An exit code of 0 that is taken for a process number would signal this whole group.
+        """
+        while True:
+            said, number = self._process.stdout.readline().split()
+            if said == what:
+                return int(number)
 
     def close(self):
         self._process.stdin.close()

@@ -15,6 +15,8 @@ def never(observations):
     raise AssertionError("asked")
 
 
+pytestmark = pytest.mark.usefixtures("no_pictures")
+
 SMALL = {"student": Mlp(4), "fit": Fit(steps=30)}
 
 

@@ -24,6 +24,8 @@ from fdtasil.rollouts.environments import EnvironmentPool
 from fdtasil.rollouts.rollout import rollout
 from fdtasil.seeding import episode_seeds
 
+pytestmark = pytest.mark.usefixtures("no_pictures")
+
 
 class Odd(Integrator):
     """The toy, with other spaces, and with what `reset` and `step` return changed on the way.

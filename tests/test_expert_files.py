@@ -22,6 +22,8 @@ from fdtasil.errors import ExpertError, SettingError
 from fdtasil.experts import twin
 from fdtasil.files.onnx import limits
 
+pytestmark = pytest.mark.usefixtures("no_pictures")
+
 
 @pytest.fixture
 def rows():

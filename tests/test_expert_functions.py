@@ -17,6 +17,8 @@ from fdtasil.errors import EnvironmentFault, ExpertError, FdtasilWarning, Settin
 from fdtasil.experts.gate import admit_expert
 from fdtasil.rollouts.environments import Boxes
 
+pytestmark = pytest.mark.usefixtures("no_pictures")
+
 
 @pytest.fixture
 def rows():

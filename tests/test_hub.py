@@ -24,6 +24,8 @@ try:
 except ImportError:
     huggingface_hub = None
 
+pytestmark = pytest.mark.usefixtures("no_pictures")
+
 needs_library = pytest.mark.skipif(huggingface_hub is None, reason="needs fdtasil[hub]")
 WALKER = "hf://org/repo/walker.onnx"
 LIMIT = 15  # seconds that an error may take

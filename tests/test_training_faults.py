@@ -212,7 +212,7 @@ def test_a_full_gpu_leaves_a_run_that_goes_on_elsewhere(
 @pytest.mark.usefixtures("many_checkpoints")
 def test_an_expert_that_fails_late_leaves_a_run_that_goes_on(moment, newest, linear, tmp_path):
     run = {**QUICK, "trainer": "dagger", "episodes": 3, "probes": "sphere:4,resample"}
-    run["fit"] = Fit(steps=60)
+    run["fit"] = Fit(steps=75)
     asked, trained = 0, []
 
     def expert(rows):
