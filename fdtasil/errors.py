@@ -19,6 +19,7 @@ __all__ = [
     "SettingError",
     "StorageError",
     "first_line",
+    "in_one_line",
     "heard_warnings",
     "printable",
     "shown",
@@ -133,6 +134,11 @@ def shown(value: object) -> str:
     """
     line = "".join(c if c.isprintable() else "?" for c in _text(value)[:201])
     return line if len(line) <= 200 else f"{line[:197]}..."
+
+
+def in_one_line(value: object) -> str:
+    """Return what came from outside with all its lines as one; see `shown`."""
+    return shown(" ".join(_text(value).split()))
 
 
 def printable(text: str) -> str:

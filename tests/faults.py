@@ -170,6 +170,27 @@ FAULTS = {
         139: "a file of ours or of others that was mutated at random",
         140: "a file of the hub without a hash",
     },
+    "strange experts": {
+        150: "an agent with its normalisation, or other wrappers, beside it",
+        151: "an expert that answers large batches otherwise, or not",
+        152: "an expert that changes during a run",
+        153: "a view that works in place",
+        154: "an expert that is sent to another process",
+        155: "a module that can't be copied",
+        156: "a library that talks to its maker",
+        157: "an address with a password or a key",
+        158: "texts that move a terminal, or that raise",
+        159: "a model that crashes, or does not end, while it is opened",
+        160: "a server that answers without end, drop by drop",
+        161: "a server that answers twice",
+        162: "a zip that is no model: TorchScript, torch.save, numpy",
+        163: "inputs, outputs and spaces that are taken for something else",
+        164: "a steep policy, whose export rounds more",
+        165: "a command that a message prints",
+        166: "a size that has a cause",
+        167: "a worker that ends by itself",
+        168: "an exported student that is quantised",
+    },
 }
 
 LEFT_OUT: dict[int, str] = {}

@@ -8,7 +8,7 @@ from typing import Literal, Protocol
 import numpy as np
 import torch
 
-from fdtasil.errors import ExpertError, SettingError, shown
+from fdtasil.errors import ExpertError, SettingError, in_one_line
 from fdtasil.experts.sb3.trust import Trust
 from fdtasil.experts.worker_process import as_array
 from fdtasil.rollouts.behaviours import Policy
@@ -157,9 +157,8 @@ class Expert:
             raise
         except Exception as error:
             kind = error.kind if isinstance(error, RaisedElsewhere) else type(error).__name__
-            text = shown(" ".join(str(error).split()))
             raise ExpertError(
-                f"{self.name} raised {kind} on {len(rows)} observations: {text}",
+                f"{self.name} raised {kind} on {len(rows)} observations: {in_one_line(error)}",
                 expected,
                 "call it on such a batch on its own; experts answer (B, n) with (B, m)",
             ) from error

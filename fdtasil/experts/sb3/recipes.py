@@ -120,9 +120,9 @@ _HARMLESS = {
 }
 # Policies that are not read, trusted or not, and what to do instead.
 FLATTENED = (
-    "wrap the environment in FlattenObservation, and pass a function: lambda rows: np.stack(["
-    "agent.predict(gymnasium.spaces.unflatten(agent.observation_space, row), deterministic=True)[0] "
-    "for row in rows])"
+    "wrap the environment in FlattenObservation, and pass a function: lambda rows: np.stack("
+    "[agent.predict(gymnasium.spaces.unflatten(agent.observation_space, row), "
+    "deterministic=True)[0] for row in rows])"
 )
 _TRAIN = "choose or train such an agent; fdtasil distils no other"
 _UNFIT = {
