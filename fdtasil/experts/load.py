@@ -12,7 +12,7 @@ from typing import Any, Protocol, runtime_checkable
 import numpy as np
 import torch
 
-from fdtasil.checks import check_count
+from fdtasil.checks import check_choice, check_count, check_flag, check_path, spelt
 from fdtasil.compute import usual_modes
 from fdtasil.errors import ExpertError, FdtasilWarning, SettingError
 from fdtasil.experts.expert import CHUNK, Expert, Hints
@@ -90,6 +90,15 @@ def load_expert(
         >>> load_expert(lambda observations: -observations[:, :2], action_size=2).name
         'the function <lambda>'
     """
+    for name, size in (("observation_size", observation_size), ("action_size", action_size)):
+        if size is not None:
+            check_count(name, size)
+    if trust is not None:
+        check_choice("trust", trust, ("pickle",))
+    if output is not None and not isinstance(output, str):
+        example = "leave it out, or write the name that a viewer of ONNX files shows"
+        raise SettingError(spelt("output", output), "the name of an output", example)
+    threads = check_flag("threads", threads)
     kind, hints = _kind_of(source), Hints(observation_size, action_size, output, trust, timeout)
     check_workers(workers, threads, timeout, kind.remote)
     expert = sized(open_expert(source, hints), observation_size, action_size)
@@ -106,6 +115,8 @@ def load_expert(
 
 def open_expert(source: ExpertLike, hints: Hints) -> Expert:
     """Open an expert whose sizes may be others than those hinted at; see `load_expert`."""
+    if isinstance(source, str | Path):
+        check_path("expert", source)
     with usual_modes():
         return _kind_of(source).opens(source, hints)
 

@@ -62,9 +62,14 @@ def as_array(answer: Any) -> Any:
         found = answer[0]
     if hasattr(found, "detach"):  # torch is not imported where the expert does not need it
         found = found.detach().cpu().float().numpy()
+    if np.ma.is_masked(found):
+        raise TypeError("it returned values that are masked")
     found = np.asarray(found)
     if found.dtype.kind == "c":
         raise TypeError("it returned complex numbers")
+    texts = found.dtype.kind == "O" and any(isinstance(one, (str, bytes)) for one in found.flat)
+    if found.dtype.kind not in "biufO" or texts:  # numpy reads numbers out of texts and dates
+        raise TypeError(f"it returned {'texts' if texts else f'values of {found.dtype}'}")
     return np.array(found, dtype=np.float32, order="C")
 
 
@@ -130,7 +135,14 @@ def _attempt(work: Callable[[], Any]) -> tuple[str, Any]:
         parts = [getattr(error, part, None) for part in ("found", "expected", "next_step")]
         if None not in parts:  # one of fdtasil's, which need not be imported to be known
             return "refused", parts
-        return "raised", (type(error).__name__, str(error), traceback.format_exc())
+        return "raised", (type(error).__name__, _text(error), traceback.format_exc())
+
+
+def _text(error: BaseException) -> str:
+    try:
+        return str(error)
+    except Exception as failure:  # of the expert's own class
+        return f"its text raises {type(failure).__name__}"
 
 
 if __name__ == "__main__":

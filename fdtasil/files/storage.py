@@ -370,6 +370,7 @@ def explain(error: OSError, path: Path, expected: str) -> StorageError:
     next_steps = {
         errno.ENOSPC: "free some space and run again; what was there before is whole",
         errno.EDQUOT: "free some space and run again; what was there before is whole",
+        errno.EMFILE: "close files that are open, or allow more of them: ulimit -n 1024",
         errno.EROFS: "choose a folder on a writable file system",
         errno.EACCES: "choose a folder that you may write to",
         errno.ENAMETOOLONG: "choose a shorter name",

@@ -1,7 +1,10 @@
 """The expert's answers around demonstrated states: asked in bounded blocks, kept in one array."""
 
+import os
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -19,6 +22,7 @@ _SHOWN = 4096
 # 50 ms a row no more than a minute is lost.
 _ROWS = 2**10
 _MUCH = 2**30  # bytes of answers that are announced before they are asked
+_NEEDED = "they need"
 _ROUNDED = 0.1  # share of a step that rounding may take before it is warned of
 
 
@@ -102,8 +106,10 @@ def ask_probes(
     try:
         return _ask_probes(expert, observations, probes, scales, random, order, beginning)
     except MemoryError as error:
+        numbers = str(error).startswith(_NEEDED) and f": {error}"
         raise SettingError(
-            f"{probes.describe()!r} at {len(observations):,} states does not fit into memory",
+            f"{probes.describe()!r} at {len(observations):,} states does not fit into memory"
+            f"{numbers or ''}",
             "answers that do",
             "pass fewer probes: they teach alike",
         ) from error
@@ -144,6 +150,8 @@ def _ask_probes(
     step = 1.0 if probes.stencil.exact else probes.radius * reach
     shown = np.linspace(0, len(observations) - 1, min(len(observations), _SHOWN)).astype(int)
     states = observations[shown][:, live] / (step * step_scale[live])
+    count = probes.directions.count(len(live))
+    _check_room(expert, probes, len(observations), observations.shape[1], count)
     bank, numbers = probes.directions.draw(len(observations), states, random)
     displacements = np.zeros((len(bank), len(step_scale)), np.float32)
     with np.errstate(over="ignore"):  # looked at in the next line
@@ -189,6 +197,36 @@ def _ask_values(
         beginning.told(values[: start + len(points)], len(points))
     assert values is not None, "there is no demonstration without a state"
     return values
+
+
+def _check_room(expert: Expert, probes: Probes, states: int, size: int, count: int) -> None:
+    """Refuse what would take more than half of the machine's memory, before anybody is asked.
+
+    The system hands out memory that it does not have, and kills who uses it.
+
+    Raises:
+        MemoryError: With the numbers.
+    """
+    points = 1 if probes.stencil is None else max(1, len(probes.stencil.offsets))
+    answers = 4 * states * count * (points * (expert.action_size or 1) + 1)
+    # Of one state: its directions, drawn, of length one and scaled, and the points they lead to.
+    at_once = count * size * (3 * 8 + 2 * 4 * points)
+    there = _memory()
+    if there is not None and answers + at_once > there / 2:
+        raise MemoryError(
+            f"{_NEEDED} {(answers + at_once) / 2**30:.3g} GiB, and at most half of "
+            f"{there / 2**30:.3g} GiB are used"
+        )
+
+
+def _memory() -> int | None:
+    """Return the bytes of memory that this process may use at most, or None if nobody says."""
+    found = []
+    with suppress(AttributeError, ValueError, OSError):  # Windows has no such call
+        found.append(os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE"))
+    with suppress(OSError, ValueError):  # of a container; "max" where there is none
+        found.append(int(Path("/sys/fs/cgroup/memory.max").read_text()))
+    return min(found, default=None)
 
 
 def _announce(values: np.ndarray) -> None:

@@ -250,14 +250,13 @@ def _reset_advice(error: Exception) -> str | None:
     said = first_line(error)
     if isinstance(error, TypeError) and "unexpected keyword argument" in said:
         return "write def reset(self, *, seed=None, options=None): gymnasium passes both by name"
-    frame = error.__traceback__
-    while frame is not None and frame.tb_next is not None:
-        frame = frame.tb_next
-    inside = frame.tb_frame.f_locals if frame is not None else {}
-    looked_into = "'NoneType' object" in said or isinstance(error, AssertionError | KeyError)
-    if "options" in said or (looked_into and inside.get("options", "") is None):
+    frame, inside = error.__traceback__, {}
+    while frame is not None:
+        inside, frame = frame.tb_frame.f_locals, frame.tb_next
+    looked_up = isinstance(error, AssertionError | KeyError) and inside.get("options", "") is None
+    if "options" in said or "'NoneType' object" in said or looked_up:
         return (
-            "give it its options in a wrapper: class WithOptions(gymnasium.Wrapper): "
+            "if it needs options, give them in a wrapper: class WithOptions(gymnasium.Wrapper): "
             "def reset(self, *, seed=None, options=None): "
             "return self.env.reset(seed=seed, options={...})"
         )

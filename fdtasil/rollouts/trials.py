@@ -211,11 +211,13 @@ def _trial(pool: EnvironmentPool, environments: Sequence[gymnasium.Env], seed: i
 def _culprit(pool: EnvironmentPool, seed: int) -> gymnasium.Env:
     """Return the innermost layer of an environment that does not repeat itself."""
     (member,) = pool.take(1)
-    for layer in reversed(list(_layers(member))):
+    layers = list(reversed(list(_layers(member))))
+    known = [layer for layer in layers if getattr(layer, "update_running_mean", False)]
+    for layer in known or layers:
         with suppress(FdtasilError):  # it may have other spaces than the whole
             if _trial(pool, [layer], seed).other_than(_trial(pool, [layer], seed)):
                 return layer
-    return member
+    return known[0] if known else member
 
 
 def _remembers(pool: EnvironmentPool, layer: gymnasium.Env, first: Trial, seed: int) -> bool:

@@ -13,7 +13,14 @@ from fdtasil.files.lock import locked
 from fdtasil.files.names import check_no_links, inside
 from fdtasil.files.reading import read_plain
 from fdtasil.files.run_format import CHECKPOINTS, CONFIG, check_free, stamped, unstamped
-from fdtasil.files.storage import is_written, remove_folder, verify, write_bytes, write_folder
+from fdtasil.files.storage import (
+    explain,
+    is_written,
+    remove_folder,
+    verify,
+    write_bytes,
+    write_folder,
+)
 from fdtasil.rollouts.trials import other_environment
 
 __all__ = ["CHECKPOINT_SECONDS", "RunFolder", "open_run_folder"]
@@ -97,7 +104,12 @@ class RunFolder:
     @property
     def begun(self) -> bool:
         """Whether there is a checkpoint to go on from."""
-        return self._path is not None and any((self._path / CHECKPOINTS).glob("*/*"))
+        if self._path is None:
+            return False
+        try:
+            return any((self._path / CHECKPOINTS).glob("*/*"))
+        except OSError as error:  # such as too many open files
+            raise explain(error, self._path, "a folder that can be read") from error
 
     @property
     def finished(self) -> bool:

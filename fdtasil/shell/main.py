@@ -1,6 +1,7 @@
 """The command line: nothing heavy is loaded before it is known what is wanted."""
 
 import difflib
+import os
 import sys
 import warnings
 from collections.abc import Callable
@@ -23,6 +24,19 @@ COMMANDS = {
 
 def main() -> None:
     """Run the command line; exit code 0 done, 1 failed, 2 wrong use, 128 + N signal N."""
+    try:
+        try:
+            _main()
+        finally:
+            sys.stdout.flush()
+    except BrokenPipeError:  # who reads what is printed has seen enough: `fdtasil ... | head`
+        nowhere = os.open(os.devnull, os.O_WRONLY)
+        for stream in (sys.stdout, sys.stderr):  # Python flushes both at its end
+            os.dup2(nowhere, stream.fileno())
+        sys.exit(128 + 13)  # SIGPIPE, where there are signals
+
+
+def _main() -> None:
     name, *rest = sys.argv[1:] or [""]
     if name == "--version":
         print(f"fdtasil {__version__}")

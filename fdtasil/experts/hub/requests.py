@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import replace
 from typing import TYPE_CHECKING, TypeVar
 
-from fdtasil.errors import ExpertError, first_line
+from fdtasil.errors import ExpertError, SettingError, first_line, shown
 from fdtasil.experts.hub.uri import COMMIT, HubUri, malformed
 
 if TYPE_CHECKING:
@@ -22,6 +22,7 @@ _SIZE_LIMIT = 2**31  # no ONNX model is larger with its weights: it is one proto
 
 def look_up(uri: HubUri) -> "tuple[HubUri, dict[str, RepoSibling]]":
     """Return the uri with its commit, and what the repository holds at it, by name."""
+    patience()  # huggingface_hub itself can't be imported where it is no number
     from huggingface_hub import HfApi
 
     def answers() -> "Iterator[tuple[HubUri, dict[str, RepoSibling]]]":
@@ -165,8 +166,23 @@ _PATIENCE = 6.0  # seconds without a sign of life after which the hub counts as 
 
 
 def patience() -> float:
-    """Return the seconds to wait; huggingface_hub's variable for slow mirrors counts here too."""
-    return max(0.0, float(os.environ.get("HF_HUB_DOWNLOAD_TIMEOUT") or _PATIENCE))
+    """Return the seconds to wait; huggingface_hub's variable for slow mirrors counts here too.
+
+    Raises:
+        SettingError: If that is no number.
+    """
+    given = os.environ.get("HF_HUB_DOWNLOAD_TIMEOUT") or _PATIENCE
+    try:
+        seconds = float(given)
+        if not seconds >= 0:
+            raise ValueError
+    except ValueError:
+        raise SettingError(
+            f"the environment variable HF_HUB_DOWNLOAD_TIMEOUT is {shown(given)!r}",
+            "whole seconds",
+            "unset HF_HUB_DOWNLOAD_TIMEOUT, or export HF_HUB_DOWNLOAD_TIMEOUT=30",
+        ) from None
+    return seconds
 
 
 def endpoint() -> str:
