@@ -401,9 +401,8 @@ def talking(say):
     def serve():
         with server:
             connection, _ = server.accept()
-            with connection:
-                with suppress(OSError):
-                    say(connection)
+            with connection, suppress(OSError):
+                say(connection)
 
     thread = threading.Thread(target=serve, daemon=True)
     thread.start()
