@@ -191,6 +191,26 @@ FAULTS = {
         167: "a worker that ends by itself",
         168: "an exported student that is quantised",
     },
+    "strange environments and arguments": {
+        175: "a wrapper, or an environment, that remembers earlier episodes",
+        176: "starts that differ by rounding",
+        177: "an observation buffer that is reused",
+        178: "copies of an environment that share one simulator",
+        179: "a run that is gone on with in another environment",
+        180: "a run that is gone on with by another expert without a hash",
+        181: "action bounds that float32 rounds outwards",
+        182: "a reset that needs options, takes no seed, or returns no info",
+        183: "texts, dates, masks and huge integers in place of numbers, and errors without a text",
+        184: "a copied folder among the checkpoints",
+        185: "arguments of another type, texts of YAML files among them",
+        186: "answers, masks and settings that numpy takes for something else",
+        187: "given data that are masked, or whose bounds are crossed",
+        188: "answers beyond the memory of the machine, which would kill the process",
+        189: "a timeout of the hub that is no number",
+        190: "a reader of the output that stops reading",
+        191: "too few file descriptors",
+        192: "a warning that names the caller's own line",
+    },
 }
 
 LEFT_OUT: dict[int, str] = {}

@@ -81,7 +81,7 @@ def test_every_odd_value_works_or_is_refused(name, parameter, tmp_path, monkeypa
         try:
             CALLS[name](**{parameter: value})
         except FdtasilError as error:
-            assert len(str(error).splitlines()) <= 6
+            assert len(str(error).splitlines()) <= 6  # noqa: PT017
 
 
 @pytest.mark.fault(185)
@@ -195,7 +195,7 @@ def test_answers_beyond_the_machines_memory_are_refused_before_they_are_asked(pr
     found = r"memory: they need [\d.e+]+ GiB, and at most half of [\d.e+]+ GiB are used"
     with pytest.raises(SettingError, match=found):
         fdtasil.distill(expert, TOY, f"{probes},radius=0.3,forward", **run)
-    assert sum(asked) < 1000
+    assert sum(asked) < 10_000  # the gate, and the demonstrations
 
 
 @pytest.mark.fault(189)
@@ -250,8 +250,8 @@ except fdtasil.FdtasilError as error:
 
 
 @pytest.mark.fault(192)
-def test_a_warning_names_the_line_that_called(recwarn):
-    with pytest.warns(FdtasilWarning, match="ends its episodes at 40 steps") as caught:
+def test_a_warning_names_the_line_that_called():
+    with pytest.warns(FdtasilWarning, match="ends its episodes at 40 steps") as caught:  # noqa: PT031
         line = inspect.currentframe().f_lineno + 1
         fdtasil.evaluate(linear, linear, TOY, episodes=1, horizon=50)
     assert {(one.filename, one.lineno) for one in caught} == {(__file__, line)}
