@@ -11,7 +11,7 @@ from types import ModuleType
 
 from fdtasil.errors import StorageError, shown
 from fdtasil.files.names import inside
-from fdtasil.files.storage import explain, make_folder, remove_file, remove_if_empty
+from fdtasil.files.storage import LOCK, explain, make_folder, remove_file, remove_if_empty
 
 try:
     import fcntl as _fcntl
@@ -20,9 +20,8 @@ except ImportError:  # Windows has no such lock; unique temporary names still ke
 else:
     _unix = _fcntl
 
-__all__ = ["LOCK", "locked", "was_locked"]
+__all__ = ["locked", "was_locked"]
 
-LOCK = ".lock"
 _HOLDER = "process "  # how the text in a lock begins
 _PAUSE = 0.02  # seconds between two looks at a lock that is waited for
 

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any
 
 from fdtasil.errors import StorageError, shown
-from fdtasil.files.lock import LOCK, was_locked
+from fdtasil.files.lock import was_locked
 from fdtasil.files.names import check_no_links, inside
 from fdtasil.files.reading import from_json, read_plain
-from fdtasil.files.storage import COMING, MANIFEST, to_json
+from fdtasil.files.storage import COMING, LOCK, MANIFEST, to_json
 
 __all__ = ["CHECKPOINTS", "COMMAND", "CONFIG", "check_free", "stamped", "unstamped"]
 
