@@ -200,7 +200,7 @@ FAULTS = {
         180: "a run that is gone on with by another expert without a hash",
         181: "action bounds that float32 rounds outwards",
         182: "a reset that needs options, takes no seed, or returns no info",
-        183: "texts, dates, masks and huge integers in place of numbers, and errors without a text",
+        183: "texts, dates, masks or huge integers for numbers; errors without a text",
         184: "a copied folder among the checkpoints",
         185: "arguments of another type, texts of YAML files among them",
         186: "answers, masks and settings that numpy takes for something else",
