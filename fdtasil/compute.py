@@ -59,8 +59,8 @@ def pick_device(device: str) -> torch.device:
 def in_turn() -> Iterator[None]:
     """Wait until no other thread is inside such a block, for what a process has only once.
 
-    Torch's threads and precision, and the simulator's warnings, are those of the whole process: two
-    runs at once would have each other's, and other bytes. A thread may enter again.
+    Torch's threads and precision, and the simulator's warnings, are those of the whole process:
+    two runs at once would have each other's, and other bytes. A thread may enter again.
     """
     while not _TURN.acquire(timeout=0.2):  # so that Ctrl-C is heard
         pass

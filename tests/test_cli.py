@@ -241,9 +241,7 @@ def test_a_process_ends_with_the_code_of_its_error(arguments, code, tmp_path):
 # --- runs that go on
 
 
-def test_a_run_goes_on_as_it_was_begun_and_a_failed_call_changes_nothing(
-    expert, inside, tmp_path
-):
+def test_a_run_goes_on_as_it_was_begun_and_a_failed_call_changes_nothing(expert, inside, tmp_path):
     failed = inside("distill", tmp_path / "none.onnx", TOY, *QUICK, "--out", tmp_path / "run")
     assert failed.returncode == 1
     assert not (tmp_path / "run").exists()

@@ -16,6 +16,7 @@ from fdtasil.run.presets import preset_of
 from fdtasil.student.batches import Batches
 from fdtasil.student.fit import Fit, Hooks, fit
 
+
 def train(spec=None, student=None, **changes):
     demonstrations, probes, ask = linear_task(spec=spec)
     student = student or new_student()

@@ -10,7 +10,6 @@ from fdtasil.probes.source import DIRECTIONS, Probes
 from fdtasil.probes.stencils import CENTRAL, FORWARD
 
 
-
 def design_of(name, count):
     """A design with so many directions, where it takes a number."""
     spec = name if name in ("basis", "jacobian") else f"{name}:{count}"

@@ -40,7 +40,7 @@ def trained(unit, bounded):
 @pytest.mark.parametrize("unit", [1e-9, 1e-4, 1e6])
 def test_actions_are_learnt_as_well_in_any_unit(unit, bounded):
     usual, states, before = trained(1.0, bounded)
-    student, scaled, history = trained(unit, bounded)
+    student, _, history = trained(unit, bounded)
     assert history[-1]["loss"] == pytest.approx(before[-1]["loss"], rel=0.05)
     error = np.abs(student.act(states.observations) / unit - usual.act(states.observations)).max()
     assert error < 0.05

@@ -153,7 +153,7 @@ def distill(
         max_queries=max_queries,
         device=device,
     )
-    torch_device, told = pick_device(arguments.device), tell_all(callback)
+    chosen, told = pick_device(arguments.device), tell_all(callback)
     with heard_warnings() as notes, open_subject(expert, env, given) as subject:
         run = arguments.configure(subject)
         run.check_budget()
@@ -164,11 +164,10 @@ def distill(
             if folder and kept.finished and resume is not None:
                 return Distilled.load(folder, student_obs)
             account = Account(subject.expert.queries if subject.expert else {}, notes)
-            asking = Asking(run, subject.expert, account)
-            checkpoints, bars = Checkpoints(kept, account, asking), Progress(progress)
-            training = Training(run, torch_device, checkpoints, bars, interrupts, told)
+            checkpoints = Checkpoints(kept, account, Asking(run, subject.expert, account))
+            training = Training(run, chosen, checkpoints, bars, interrupts, told)
             rounds = Rounds(run, student_obs, _collecting(run, subject, bars), training)
-            result = _complete(rounds, subject, given, torch_device, force=force)
+            result = _complete(rounds, subject, given, chosen, force=force)
             if folder:
                 write_run(result, folder)
                 kept.close()
