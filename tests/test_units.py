@@ -104,7 +104,7 @@ def test_observations_far_from_zero_are_refused_in_float32(offset):
 def test_a_single_coordinate_far_from_zero_is_warned_of():
     box = gymnasium.spaces.Box(-np.inf, np.inf, (3,), np.float64)
     clock = gymnasium.wrappers.TransformObservation(
-        gymnasium.make("Pendulum-v1"), lambda o: o.astype(np.float64) + [0, 0, 1e9], box
+        gymnasium.make("Pendulum-v1"), lambda o: np.add(o, [0, 0, 1e9], dtype=np.float64), box
     )
     with EnvironmentPool(clock) as pool, pytest.warns(FdtasilWarning, match="how 1 of the 3"):
         rollout(follow(lambda rows: 0 * rows[:, :1]), pool, [1, 2], 30)

@@ -155,7 +155,7 @@ def distill(
     )
     chosen, told = pick_device(arguments.device), tell_all(callback)
     with heard_warnings() as notes, open_subject(expert, env, given) as subject:
-        run = arguments.configure(subject)
+        run, bars = arguments.configure(subject), Progress(progress)
         run.check_budget()
         with (
             open_run_folder(folder, config_of(run), resume=resume is not None) as kept,
