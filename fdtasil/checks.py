@@ -47,16 +47,20 @@ def check_count(name: str, value: object, least: int = 1, most: int | None = Non
     expected = "a positive integer" if least == 1 else f"an integer of at least {least}"
     if most is not None:
         expected = f"an integer from {least} to {most}"
-    raise SettingError(spelt(name, value), expected, _example(name, value, max(least, 5)))
+    example = max(least, 5) if most is None else min(max(least, 5), most)
+    raise SettingError(spelt(name, value), expected, _example(name, value, example))
 
 
-def check_number(name: str, value: object, *, positive: bool = False) -> float:
+def check_number(
+    name: str, value: object, *, positive: bool = False, example: float = 1.0
+) -> float:
     """Return a finite number of at least 0 as a plain float.
 
     Args:
         name: What the caller calls it.
         value: What was given; a text is no number, also where it looks like one.
         positive: Whether 0 is refused too.
+        example: A number that can be used.
 
     Raises:
         SettingError: If it can't be used.
@@ -65,7 +69,7 @@ def check_number(name: str, value: object, *, positive: bool = False) -> float:
     if number is not None and (number > 0 or (number == 0 and not positive)) and number < math.inf:
         return number
     expected = "a positive number" if positive else "a number of at least 0"
-    raise SettingError(spelt(name, value), expected, _example(name, value, 1.0))
+    raise SettingError(spelt(name, value), expected, _example(name, value, example))
 
 
 def check_share(name: str, value: object, *, whole: bool = True) -> float:

@@ -282,7 +282,7 @@ def test_what_the_actions_do_not_depend_on_is_no_part_of_the_twin(tmp_path, rows
         (lambda rows: rows[:, :3], "shape"),
         (lambda rows: np.full((len(rows), 2), np.nan), "not finite on 37 of 37"),
         (lambda rows: 1 / 0, "raised ZeroDivisionError"),
-        (lambda rows: "text", "raised ValueError"),
+        (lambda rows: "text", "raised TypeError"),
     ],
 )
 def test_a_wrong_answer_is_described(answer, found, rows):

@@ -266,8 +266,8 @@ def test_a_resampling_source_stops_at_the_budget(linear, monkeypatch):
         return linear(observations)
 
     with pytest.raises(SettingError, match="more are due"):
-        fdtasil.distill(counted, TOY, "sphere:2,resample", max_queries=500, **QUICK)
-    assert sum(asked) <= 500
+        fdtasil.distill(counted, TOY, "sphere:2,resample", max_queries=2000, **QUICK)
+    assert sum(asked) <= 2000
 
 
 def test_no_evaluation_is_asked_for_and_none_is_made(linear):

@@ -1,6 +1,7 @@
 """Finite differences that can't be taken: refused, warned of, or taken so that they are right."""
 
 import tracemalloc
+from contextlib import nullcontext
 
 import gymnasium
 import numpy as np
@@ -149,11 +150,16 @@ def test_a_coordinate_so_large_that_it_stands_still_is_frozen_and_counted(offset
     def expert(rows):
         return np.clip((rows - move) @ GAIN.T, -1, 1)
 
-    result = fdtasil.distill(expert, environment, "basis", **QUICK)
+    # It still moves by a step of float32 or two at 1e7, which is said.
+    heard = pytest.warns(FdtasilWarning, match="rounds away how 1 of the 4")
+    with heard if offset == 1e7 else nullcontext():
+        result = fdtasil.distill(expert, environment, "basis", **QUICK)
     assert result.report["frozen_coordinates"] == 2
     assert not result.answers.displacements[:, 0].any()
-    with pytest.warns(FdtasilWarning, match="of the step along coordinate 0, of .* beside values"):
+    with pytest.warns(FdtasilWarning) as caught:
         fdtasil.distill(expert, environment, "sphere:3,forward,raw,radius=0.01", **QUICK)
+    said = " ".join(str(one.message) for one in caught)
+    assert "of the step along coordinate 0, of " in said
 
 
 @pytest.mark.fault(89)

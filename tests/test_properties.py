@@ -248,7 +248,9 @@ def test_demonstrations_read_back_with_and_without_answers(sizes, seed, probes, 
     answers = None
     if probes is not None:
         numbers = np.arange(count * k, dtype=np.int32).reshape(count, k)
-        bank, values = random_array(seed, (count * k, n)), random_array(seed, (count, k, 2, m))
+        points = len(probes.stencil.offsets) if probes.stencil and not probes.exact else 2
+        bank = random_array(seed, (count * k, n))
+        values = random_array(seed, (count, k, points, m))
         answers = Answers(bank, numbers, values, 1.25)
     bound = np.full(m, limit, np.float32)
     dataset = Dataset(demonstrations, probes, answers, -bound, bound, name)

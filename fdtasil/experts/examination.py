@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -84,7 +85,8 @@ def check_first(
     """
     check_repeats(pool, starts[0], force=force)
     first = first_observations(pool, [starts[e % len(starts)] for e in range(GATE_STATES)])
-    _announce(admit_expert(expert, first, pool.boxes, force=force, largest=largest), rows)
+    announce = partial(_announce, rows=rows)
+    admit_expert(expert, first, pool.boxes, force=force, largest=largest, announce=announce)
 
 
 def _announce(seconds: float, rows: int) -> None:
@@ -115,7 +117,13 @@ class Looked:
 
 
 def look_closely(
-    source: ExpertLike, pool: EnvironmentPool, horizon: int | None, seed: int, episodes: int
+    source: ExpertLike,
+    pool: EnvironmentPool,
+    horizon: int | None,
+    seed: int,
+    episodes: int,
+    *,
+    with_chance: bool = True,
 ) -> Looked:
     """Open a policy, let it and chance act, and check it on states that it visited.
 
@@ -125,6 +133,7 @@ def look_closely(
         horizon: T, or None for the environment's own.
         seed: Of the episodes.
         episodes: How many.
+        with_chance: Whether chance acts too.
 
     Raises:
         EnvironmentFault: If the environment can't be used.
@@ -142,8 +151,10 @@ def look_closely(
         own = rollout(follow(expert.policy("act")), pool, starts, length)
     except ExpertError as error:
         return Looked([opening, Finding("answers", error.found, error)], expert)
-    noise = [generator(seed, "random actions", episode) for episode in range(episodes)]
-    chance = rollout(random_behaviour(pool), pool, starts, length, noise)
+    chance = None
+    if with_chance:
+        noise = [generator(seed, "random actions", episode) for episode in range(episodes)]
+        chance = rollout(random_behaviour(pool), pool, starts, length, noise)
     states = own.spread(LOOKED_AT)
     examined = [*examine_expert(expert, states, boxes), _batch_sizes(expert, states)]
     return Looked([opening, *examined], expert, own, chance)

@@ -93,15 +93,15 @@ class Expert:
     observation_size: int | None = None
     action_size: int | None = None
     sha256: str | None = None
-    source: str | None = None
-    columns: tuple[int, ...] | None = None
     module: torch.nn.Module | None = None
     chunk: int = CHUNK
     workers: Workers | None = None
     queries: Counter[str] = field(default_factory=Counter)
+    source: str | None = None
+    columns: tuple[int, ...] | None = None
 
     def ask(self, observations: np.ndarray, purpose: Purpose) -> np.ndarray:
-        """Policy a batch and count its rows.
+        """Answer a batch and count its rows.
 
         Args:
             observations: (B, n) finite raw observations, in any type that numpy takes for

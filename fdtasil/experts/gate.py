@@ -1,7 +1,7 @@
 """The gate: what an expert must show on real states before anything is spent on it."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -69,13 +69,17 @@ def examine_expert(expert: Expert, observations: np.ndarray, boxes: Boxes) -> li
         answer has the first finding only.
     """
     largest = large_batch(expert.chunk, expert.chunk)
-    return _examine(expert, observations, boxes, largest)[0]
+    return _examine(expert, observations, boxes, largest)
 
 
 def _examine(
-    expert: Expert, observations: np.ndarray, boxes: Boxes, largest: int
-) -> tuple[list[Finding], float]:
-    """Return the findings, and the seconds that a row takes."""
+    expert: Expert,
+    observations: np.ndarray,
+    boxes: Boxes,
+    largest: int,
+    announce: Callable[[float], None] = lambda seconds: None,
+) -> list[Finding]:
+    """Return the findings; the seconds that a row takes are announced before the large batch."""
     times = [time.perf_counter()]
     try:
         answers = expert.ask(observations, "check")
@@ -85,11 +89,12 @@ def _examine(
         alone = np.concatenate([expert.ask(row[None], "check") for row in observations])
         times.append(time.perf_counter())
     except ExpertError as error:
-        return [Finding("answers", error.found, error)], 0.0
-    seconds = float(np.diff(times).min()) / len(observations)
+        return [Finding("answers", error.found, error)]
+    # The first query may start workers, and any may meet a busy machine: the quickest counts.
+    announce(float(np.diff(times).min()) / len(observations))
     probe = _Answers(expert, observations, answers, boxes)
     found = Finding("answers", f"{answers.shape[1]} finite numbers for each observation", None)
-    findings = [
+    return [
         found,
         probe.same(again, "determinism", "asked twice", _STOCHASTIC),
         probe.same(alone, "batch independence", "asked alone and in a batch", _BATCH_DEPENDENT),
@@ -97,8 +102,6 @@ def _examine(
         probe.within_bounds(),
         probe.fills_bounds(),
     ]
-    # The first query may start workers, and any may meet a busy machine: the quickest counts.
-    return findings, seconds
 
 
 def admit_expert(
@@ -108,7 +111,8 @@ def admit_expert(
     *,
     force: bool = False,
     largest: int = 0,
-) -> float:
+    announce: Callable[[float], None] = lambda seconds: None,
+) -> None:
     """Check an expert on real states, and raise what is wrong with it.
 
     Args:
@@ -117,16 +121,13 @@ def admit_expert(
         boxes: The environment's spaces.
         force: Warn instead of raising, where the expert answers at all.
         largest: Rows of the large batch that is asked too; see `large_batch`.
-
-    Returns:
-        Seconds that a row takes, in such a batch or alone.
+        announce: Told the seconds that a row takes, before that batch.
 
     Raises:
         ExpertError: The first problem found.
     """
-    findings, seconds = _examine(expert, observations, boxes, largest)
+    findings = _examine(expert, observations, boxes, largest, announce)
     raise_problems(findings, force=force)
-    return seconds
 
 
 def compare_again(expert: Expert, observations: np.ndarray, answers: np.ndarray) -> None:

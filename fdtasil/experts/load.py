@@ -100,7 +100,7 @@ def load_expert(
         raise SettingError(spelt("output", output), "the name of an output", example)
     threads = check_flag("threads", threads)
     kind, hints = _kind_of(source), Hints(observation_size, action_size, output, trust, timeout)
-    check_workers(workers, threads, timeout, kind.remote)
+    workers, timeout = check_workers(workers, threads, timeout, kind.remote)
     expert = sized(open_expert(source, hints), observation_size, action_size)
     if batch is None and workers and expert.chunk == CHUNK:
         batch = BATCH

@@ -49,7 +49,7 @@ def open_onnx(source: str | Path, hints: Hints) -> Expert:
             size_hint(n, wanted),
         )
     twin = _twin(model, policy, n, path)
-    return Expert(policy, path.name, n, m, digest, str(source), columns, twin)
+    return Expert(policy, path.name, n, m, digest, twin, source=str(source), columns=columns)
 
 
 def _is_straight(model: "onnx.ModelProto") -> bool:

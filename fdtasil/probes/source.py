@@ -74,7 +74,7 @@ class Probes:
             raise SettingError(found, "a design, and a stencil or None", example)
         if self.directions.exact and self.stencil is None:
             object.__setattr__(self, "stencil", EXACT)
-        if (self.stencil is EXACT) != self.directions.exact:
+        if self.exact != self.directions.exact:
             name = self.stencil.name if self.stencil else "open"
             raise SettingError(
                 f"the {name} stencil with {self.directions.name} directions",
@@ -103,7 +103,7 @@ class Probes:
         if spec is None or isinstance(spec, Probes):
             return spec
         if isinstance(spec, str):
-            if spec.isdigit():
+            if spec.isascii() and spec.isdigit():
                 return Probes.parse(int(spec))
             return None if spec == "none" else _parse_text(spec)
         try:
@@ -125,7 +125,7 @@ class Probes:
     @property
     def exact(self) -> bool:
         """Whether the expert is differentiated, and not asked."""
-        return self.stencil is EXACT
+        return self.stencil is not None and self.stencil.exact
 
     def with_order(self, order: int, usual: Stencil | None = FORWARD) -> "Probes":
         """Return the source with a stencil that has differences up to `order`.

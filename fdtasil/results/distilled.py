@@ -76,7 +76,7 @@ class Distilled:
         lines = [
             f"{self.report['env']}: {len(self.demonstrations):,} states, probes "
             f"{self.report['probes']}, {self.report['steps']:,} steps",
-            f"asked of the expert: {rows_text(self.queries) or 'nothing'}",
+            f"queries: {rows_text(self.queries) or 'none'}",
             "trained without an evaluation" if self.evaluation is None else str(self.evaluation),
         ]
         return "\n".join(lines)
@@ -129,9 +129,11 @@ class Distilled:
             folder: One that is missing, empty, or a run's, which is replaced.
 
         Raises:
+            ExportError: If the student's weights are not finite.
             StorageError: If a file can't be written, or the folder is none of these; finished
                 files stay whole.
         """
+        self.export_bytes("student.safetensors")  # what is spoilt is refused before all else
         place = Path(folder).absolute()
         check_free(place)
         with locked(place, _PATIENCE):

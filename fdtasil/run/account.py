@@ -26,6 +26,7 @@ class Account:
         self._ledger, self._notes = ledger, notes
         self._earlier: dict[str, Any] = {"queries": {}, "again": 0, "notes": [], "seconds": 0.0}
         self._before: Mapping[str, int] = {}  # the ledger, when that was taken up
+        self._heard = 0  # notes of this process, when that was taken up
         self._repeated: Counter[str] = Counter()
         self._began = time.perf_counter()
 
@@ -48,7 +49,8 @@ class Account:
     def notes(self) -> list[str]:
         """The warnings, those of the interrupted part first, and none of them twice for it."""
         earlier = self._earlier["notes"]
-        return [*earlier, *(note for note in self._notes if note not in earlier)]
+        again, new = self._notes[: self._heard], self._notes[self._heard :]
+        return [*earlier, *(note for note in again if note not in earlier), *new]
 
     @property
     def seconds(self) -> float:
@@ -72,6 +74,7 @@ class Account:
     def take_up(self, earlier: dict[str, Any]) -> None:
         """Go on from a checkpoint; what this process asked before, the interrupted one had too."""
         self._earlier, self._before = earlier, dict(self._ledger)
+        self._heard = len(self._notes)
         self._repeated.clear()  # the whole ledger is
         self.start_clock()
 

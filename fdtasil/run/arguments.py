@@ -9,7 +9,7 @@ from fdtasil.errors import SettingError
 from fdtasil.files.storage import sha256
 from fdtasil.probes.directions import USUAL_COUNT
 from fdtasil.probes.source import Probes
-from fdtasil.probes.stencils import EXACT, FORWARD
+from fdtasil.probes.stencils import FORWARD
 from fdtasil.rollouts.environments import resolve_horizon
 from fdtasil.rollouts.trials import fingerprint
 from fdtasil.run.configuration import Configuration
@@ -120,8 +120,6 @@ def read_arguments(
     """
     defaults = preset_of(preset)
     fit = defaults.fit if fit is None else _checked_fit(fit)
-    if max_queries is not None:
-        check_count("max_queries", max_queries, least=0)
     return Arguments(
         given=given,
         preset=defaults,
@@ -134,7 +132,7 @@ def read_arguments(
         student_obs=student_obs,
         fit=fit,
         evaluation_episodes=check_count("evaluation_episodes", evaluation_episodes, least=0),
-        max_queries=max_queries,
+        max_queries=None if max_queries is None else check_count("max_queries", max_queries, 0),
         device=_checked_device(device),
     )
 
@@ -197,11 +195,11 @@ def _source_of(
 def _from_store(stored: Probes, order: int, given: Dataset | None) -> Probes:
     """Return the source of stored answers: nobody is asked anew."""
     values = given.answers.values if given is not None and given.answers is not None else None
-    if order == 2 and stored.stencil is EXACT and values is not None and values.shape[2] < 2:
+    if order == 2 and stored.exact and values is not None and values.shape[2] < 2:
         raise SettingError(
             "order=2 with stored derivatives of first order",
             "a dataset made with order=2",
-            "record one with order=2, or pass order=1",
+            "record one with order=2, or pass fit=Fit(order=1)",
         )
     return replace(stored.with_order(order), resample=False)
 

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from typing import Any
 
 from fdtasil.demonstrations.trainers import Trainer, describe_trainer
@@ -139,7 +139,7 @@ class Configuration:
             "trainer": describe_trainer(self.trainer) if self.trainer else "none",
             "probes": self.probes.describe() if self.probes else "none",
             "student": describe(self.student),
-            "fit": asdict(self.fit),
+            "fit": self.fit.to_json(),
         }
         whole = {name: written.get(name, value) for name, value in vars(self).items()}
         return json.loads(

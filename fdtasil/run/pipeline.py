@@ -37,7 +37,7 @@ from fdtasil.run.training import Training
 from fdtasil.seeding import episode_seeds
 from fdtasil.student.architectures import Architecture, Mlp
 from fdtasil.student.fit import Fit
-from fdtasil.student.view import StudentObservation, View
+from fdtasil.student.view import StudentObservation, View, view_size
 
 __all__ = ["distill", "evaluate"]
 
@@ -220,7 +220,7 @@ def evaluate(
     with EnvironmentPool(env) as pool, torch_settings(torch.device("cpu")):
         n, m = pool.boxes.observation_size, pool.boxes.action_size
         black_box, length = load_expert(expert, n, m), resolve_horizon(horizon, pool)
-        judged = open_expert(policy, Hints(n if student_obs is None else None, m))
+        judged = open_expert(policy, Hints(view_size(student_obs, n), m))
         starts = episode_seeds(seed, "evaluation", 0, count)
         most = large_batch(count, black_box.chunk)
         theirs = examine(black_box, pool, starts, length, bars, force=force, largest=most)

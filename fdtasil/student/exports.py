@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from fdtasil.errors import SettingError
-from fdtasil.files.onnx.export import export_module
+from fdtasil.files.onnx.export import check_finite, export_module
 from fdtasil.student.policy import Student
 
 __all__ = ["EXPORTS", "export"]
@@ -16,6 +16,7 @@ Writer = Callable[[Student, np.ndarray, Mapping[str, str]], bytes]
 
 
 def _safetensors(student: Student, states: np.ndarray, metadata: Mapping[str, str]) -> bytes:
+    check_finite(student)
     return student.to_bytes(metadata)
 
 

@@ -2,9 +2,10 @@
 
 import math
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from functools import partial
 from itertools import count, islice
+from typing import Any
 
 import numpy as np
 import torch
@@ -74,15 +75,15 @@ class Fit:
     patience: int | None = None
 
     def __post_init__(self) -> None:
-        for name in ("steps", "epochs", "batch_size", "order", "patience"):
+        for name in ("steps", "epochs", "batch_size", "patience"):
             self._check(name, check_count)
-        for name in ("weight_decay", "epsilon", "weight", "curvature_weight"):
-            self._check(name, check_number)
-        for name in ("learning_rate", "max_gradient_norm"):
-            self._check(name, partial(check_number, positive=True))
+        self._check("order", partial(check_count, most=2))
+        for name in ("learning_rate", "weight_decay", "epsilon", "weight", "curvature_weight"):
+            usual = Fit.__dataclass_fields__[name].default
+            positive = name == "learning_rate"
+            self._check(name, partial(check_number, positive=positive, example=usual))
+        self._check("max_gradient_norm", partial(check_number, positive=True))
         self._check("validation", partial(check_share, whole=False))
-        if self.order > 2:
-            raise SettingError(f"order={self.order}", "1 or 2", "write order=1; probes=0 is 0")
         if self.steps is not None and self.epochs is not None:
             found = f"steps={self.steps}, epochs={self.epochs}"
             raise SettingError(found, "one of the two", "leave one out")
@@ -98,6 +99,13 @@ class Fit:
         value = getattr(self, name)
         if value is not None or Fit.__dataclass_fields__[name].default is not None:
             object.__setattr__(self, name, check(name, value))
+
+    def to_json(self) -> dict[str, Any]:
+        """Return the fields as plain JSON values, and the rule for a length that is left out."""
+        rule: dict[str, Any] = {"steps_for": None}
+        if self.steps is None and self.epochs is None:
+            rule = {"steps": _USUAL_STEPS, "steps_for": _USUAL_STATES}
+        return {**asdict(self), **rule}
 
     def steps_an_epoch(self, states: int) -> int:
         """Return the minibatches that visit each of `states` states once."""

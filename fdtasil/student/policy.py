@@ -90,7 +90,7 @@ class Student(nn.Module):
             squashed = torch.where(self._bounded, squashed, raw)
         return self._centre + self._half * squashed
 
-    def write(self, graph: Graph, value: str) -> str:
+    def write_onnx(self, graph: Graph, value: str) -> str:
         """Add the nodes of the student to an ONNX graph; see `Writable`."""
         centred = graph.node("Sub", value, graph.constant(self.mean))
         raw = graph.module(self.network, graph.node("Div", centred, graph.constant(self.scale)))

@@ -14,7 +14,7 @@ from fdtasil.errors import SettingError, first_line
 from fdtasil.probes.answers import Answers
 from fdtasil.rollouts.behaviours import Policy
 
-__all__ = ["StudentObservation", "Unseen", "View", "describe_view"]
+__all__ = ["StudentObservation", "Unseen", "View", "describe_view", "view_size"]
 
 StudentObservation = Sequence[int] | Callable[[np.ndarray], np.ndarray]
 """Indices of the coordinates that the student sees, or (B, n) -> (B, k)."""
@@ -148,6 +148,13 @@ class View:
         points = states[:, None, :] + moved
         seen = self.look(points.reshape(-1, points.shape[-1]))
         return seen.reshape(*points.shape[:2], -1) - centres[:, None, :]
+
+
+def view_size(student_obs: StudentObservation | None, n: int) -> int | None:
+    """Return how many of n coordinates a student sees; None where only asking tells."""
+    if student_obs is None:
+        return n
+    return None if callable(student_obs) else len(_indices(student_obs, n))
 
 
 def describe_view(student_obs: object, n: int) -> tuple[int, ...] | str | None:

@@ -55,7 +55,7 @@ class Normalise(nn.Module):
         normalised = (observations - self.mean - self.rest) / self.scale
         return normalised.clamp(-self.clip, self.clip)
 
-    def write(self, graph: Graph, value: str) -> str:
+    def write_onnx(self, graph: Graph, value: str) -> str:
         """Add its nodes to an ONNX graph; see `Writable`."""
         for shift in (self.mean, self.rest):
             value = graph.node("Sub", value, graph.constant(shift))
@@ -81,7 +81,7 @@ class Rescale(_Bounded):
         """(B, m) in -1..1 -> (B, m) in environment units."""
         return self.low + 0.5 * (squashed + 1.0) * (self.high - self.low)
 
-    def write(self, graph: Graph, value: str) -> str:
+    def write_onnx(self, graph: Graph, value: str) -> str:
         """Add its nodes to an ONNX graph; see `Writable`."""
         shifted = graph.node("Add", value, graph.constant(1.0))
         halved = graph.node("Mul", shifted, graph.constant(0.5))
@@ -96,7 +96,7 @@ class Clip(_Bounded):
         """(B, m) -> (B, m), both in environment units."""
         return torch.minimum(torch.maximum(actions, self.low), self.high)
 
-    def write(self, graph: Graph, value: str) -> str:
+    def write_onnx(self, graph: Graph, value: str) -> str:
         """Add its nodes to an ONNX graph; see `Writable`."""
         raised = graph.node("Max", value, graph.constant(self.low))
         return graph.node("Min", raised, graph.constant(self.high))

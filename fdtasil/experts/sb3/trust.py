@@ -17,4 +17,7 @@ def check_trust(trust: Trust) -> None:
         raise SettingError(f"trust={trust!r}", '"pickle" or None', 'write trust="pickle"')
 
 
-TRUST = 'if you trust its source, write trust="pickle": that runs the code in the zip'
+TRUST = (
+    'if you trust its source, write load_expert(path, trust="pickle") (--trust pickle in a '
+    "shell): that runs the code in the zip"
+)

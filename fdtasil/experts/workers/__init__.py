@@ -22,8 +22,10 @@ __all__ = ["check_workers", "with_processes", "with_threads"]
 BATCH = 8
 
 
-def check_workers(workers: int, threads: bool, timeout: float | None, remote: bool) -> None:
-    """Check how an expert is to be asked.
+def check_workers(
+    workers: int, threads: bool, timeout: float | None, remote: bool
+) -> tuple[int, float | None]:
+    """Return how an expert is to be asked: workers and timeout, as plain numbers.
 
     Args:
         workers: How many processes or threads.
@@ -34,20 +36,21 @@ def check_workers(workers: int, threads: bool, timeout: float | None, remote: bo
     Raises:
         SettingError: If the arguments don't go together.
     """
-    check_count("workers", workers, least=0)
+    workers = check_count("workers", workers, least=0)
     if threads and not workers:
         raise SettingError(
             "threads=True with workers=0", "a number of threads", "write workers=2, threads=True"
         )
     if timeout is None:
-        return
-    check_number("timeout", timeout, positive=True)
+        return workers, None
+    timeout = check_number("timeout", timeout, positive=True)
     if not remote and (threads or not workers):
         raise SettingError(
             f"timeout={timeout:g} without processes",
             "an expert in a process of its own: only that can be ended while it hangs",
             "write workers=1, or leave timeout= out",
         )
+    return workers, timeout
 
 
 def with_threads(expert: Expert, workers: int) -> Expert:

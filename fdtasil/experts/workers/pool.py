@@ -25,7 +25,7 @@ class Asker(Protocol):
         ...
 
     def answer(self, rows: np.ndarray, /) -> np.ndarray:
-        """Policy one batch; never called twice at a time."""
+        """Answer one batch; never called twice at a time."""
         ...
 
     def stop(self) -> None:

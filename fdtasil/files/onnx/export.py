@@ -19,7 +19,22 @@ from fdtasil.files.onnx.session import open_session, run_session
 if TYPE_CHECKING:
     import onnx
 
-__all__ = ["export_module"]
+__all__ = ["check_finite", "export_module"]
+
+
+def check_finite(module: torch.nn.Module) -> None:
+    """Refuse weights that are not finite; an infinite one may hide behind a tanh.
+
+    Raises:
+        ExportError: If there is one.
+    """
+    if not all(torch.isfinite(weights).all() for weights in module.parameters()):
+        raise ExportError(
+            f"{type(module).__name__} has weights that are not finite",
+            "finite numbers",
+            "train it again: it did not learn what it answers",
+        )
+
 
 # Of the largest action: what two ways to compute the same may differ by, and by rounding at most.
 _AGREEMENT, _MOST_ROUNDING = 1e-5, 1e-3
@@ -66,12 +81,7 @@ def export_module(
     onnx.helper.set_model_props(model, dict(metadata))
     session = open_session(model, "the export")
     answers = run_session(session, "actions", example.numpy())
-    if not all(torch.isfinite(weights).all() for weights in module.parameters()):
-        raise ExportError(  # an infinite one may hide behind a tanh
-            f"{type(module).__name__} has weights that are not finite",
-            "finite numbers",
-            "train it again: it did not learn what it answers",
-        )
+    check_finite(module)
     difference = float(np.abs(answers - expected).max())
     largest = max(1.0, float(np.abs(expected).max()))
     near = difference <= _AGREEMENT * largest  # not so for NaN

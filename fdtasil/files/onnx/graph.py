@@ -20,7 +20,7 @@ _IR_VERSION = 8  # the oldest that has this opset
 class Writable(Protocol):
     """A module that knows its own nodes."""
 
-    def write(self, graph: "Graph", value: str) -> str:
+    def write_onnx(self, graph: "Graph", value: str) -> str:
         """Add the nodes that turn `value` into the module's answer, and return its name."""
         ...
 
@@ -56,7 +56,7 @@ class Graph:
             KeyError: If it is a layer without a row in the table.
         """
         if isinstance(module, Writable):
-            return module.write(self, value)
+            return module.write_onnx(self, value)
         return LAYERS[type(module)](self, module, value)
 
 
