@@ -49,7 +49,7 @@ def files_of(folder):
 
 
 @pytest.mark.fault(195)
-@pytest.mark.parametrize("count", [2, 8])
+@pytest.mark.parametrize("count", [2, pytest.param(8, marks=pytest.mark.slow)])
 def test_runs_in_threads_have_the_bytes_that_they_have_alone(count, expert, tmp_path):
     alone = {}
     for seed in range(count):

@@ -237,7 +237,8 @@ def _as_kind(name: str, array: np.ndarray) -> np.ndarray:
         if int(array.min()) < room.min or int(array.max()) > room.max:
             raise ValueError(f"{name} beyond {kind}")
     with np.errstate(over="ignore"):  # infinite then, which is refused as such
-        return np.asarray(array, kind)  # in its own order, which is written again
+        # Ours keep the order of their axes in memory, which is written again.
+        return np.asarray(array, kind, order="K" if array.dtype == kind else "C")
 
 
 def _read(arrays: Mapping[str, np.ndarray]) -> Dataset:

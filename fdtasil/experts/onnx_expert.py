@@ -39,17 +39,26 @@ def open_onnx(source: str | Path, hints: Hints) -> Expert:
     model, digest = read_model(path)
     columns, data = _columns(model, path), model.SerializeToString()
     wanted = None if columns else hints.observation_size
-    call = (data, str(path), wanted, hints.action_size, hints.output)
-    try_out(digest, str(path), call, straight=_is_straight(model))
-    policy, n, m = open_policy(*call)
-    if wanted not in (None, n):
+    n = _declared_size(model)
+    if n and wanted not in (None, n):
         raise ExpertError(
             f"{path} wants {n} observations, the environment gives {wanted}",
             "an expert of this environment",
             size_hint(n, wanted),
         )
+    call = (data, str(path), wanted, hints.action_size, hints.output)
+    try_out(digest, str(path), call, straight=_is_straight(model))
+    policy, n, m = open_policy(*call)
     twin = _twin(model, policy, n, path)
     return Expert(policy, path.name, n, m, digest, twin, source=str(source), columns=columns)
+
+
+def _declared_size(model: "onnx.ModelProto") -> int:
+    """Return n as the only input says it; 0 where it leaves it open, or there are several."""
+    constants = {tensor.name for tensor in model.graph.initializer}
+    inputs = [entry for entry in model.graph.input if entry.name not in constants]
+    dimensions = inputs[0].type.tensor_type.shape.dim if len(inputs) == 1 else []
+    return max(0, dimensions[-1].dim_value) if dimensions else 0
 
 
 def _is_straight(model: "onnx.ModelProto") -> bool:

@@ -63,8 +63,8 @@ class Rounds:
         lesson, trained = None, None
         for round_, count in enumerate(self.run.rounds):
             policy = lesson.view.policy(trained.student.act) if lesson and trained else None
-            collected = self._collected(round_, count, collected, lesson, policy)
-            lesson = Lesson.of(collected, self.student_obs, lesson)
+            lesson = self._learnt_from(round_, count, collected, lesson, policy)
+            collected = lesson.collected
             trained = self._trained(round_, lesson, trained)
             last = trained.history[-1]
             self.training.callback(Event("round", round_, trained.steps, last, trained.student))
@@ -78,25 +78,30 @@ class Rounds:
                 round_, TRAINED, lambda: self.training.train(round_, lesson, before)
             )
 
-    def _collected(
+    def _learnt_from(
         self,
         round_: int,
         count: int,
         before: Collected | None,
         lesson: Lesson | None,
         student: Policy | None,
-    ) -> Collected:
+    ) -> Lesson:
         """Return all that a round learns from: recorded, labelled, and probed around."""
+        made = list[Lesson]()
 
         def collect() -> Collected:
-            if self.collecting is None:
-                assert before is not None, "the dataset is given"
-                asks = self.run.probes is not None and not self.run.probes_given
-                return self._probed(round_, before, None, lesson) if asks else before
-            new = self._recorded(self.collecting, round_, count, before, student)
-            return self._probed(round_, new, before, lesson)
+            if self.collecting is not None:
+                new = self._recorded(self.collecting, round_, count, before, student)
+                made.append(self._probed(round_, new, before, lesson))
+                return made[0].collected
+            assert before is not None, "the dataset is given"
+            if self.run.probes is None or self.run.probes_given:
+                return before
+            made.append(self._probed(round_, before, None, lesson))
+            return made[0].collected
 
-        return self._once(round_, COLLECTED, collect)
+        collected = self._once(round_, COLLECTED, collect)
+        return made[0] if made else Lesson.of(collected, self.student_obs, lesson)
 
     def _recorded(
         self,
@@ -131,7 +136,7 @@ class Rounds:
 
     def _probed(
         self, round_: int, new: Collected, before: Collected | None, lesson: Lesson | None
-    ) -> Collected:
+    ) -> Lesson:
         """Join what is new with what was there before, and ask the probes around the new."""
         states, old = new.dataset.demonstrations, None
         whole = new
@@ -139,15 +144,14 @@ class Rounds:
             joined = before.dataset.demonstrations + states
             whole = replace(new, dataset=replace(before.dataset, demonstrations=joined))
             old = before.dataset.answers
-        if self.run.probes is None:
-            return whole
         around = Lesson.of(whole, self.student_obs, lesson)
+        if self.run.probes is None:
+            return around
         answers = self._answers(round_, states.observations, around)
         answers = answers if old is None else old + answers
-        return replace(
-            whole,
-            dataset=replace(whole.dataset, probes=self.checkpoints.asking.source, answers=answers),
-        )
+        source = self.checkpoints.asking.source
+        dataset = replace(whole.dataset, probes=source, answers=answers)
+        return replace(around, collected=replace(whole, dataset=dataset))
 
     def _answers(self, round_: int, observations: np.ndarray, lesson: Lesson) -> Answers:
         """Ask the probes around a round's states; the answers are kept on the way."""
