@@ -12,6 +12,8 @@ from fdtasil.experts.gate import admit_expert
 from fdtasil.experts.load import load_expert
 from fdtasil.rollouts.environments import Boxes
 
+pytestmark = pytest.mark.usefixtures("no_pictures")
+
 BOXES = Boxes(5, -np.ones(2, np.float32), np.ones(2, np.float32))
 NOISE = np.random.default_rng(0)
 

@@ -17,6 +17,8 @@ import fdtasil
 from fdtasil.errors import ExpertError, SettingError
 from fdtasil.experts import http_expert
 
+pytestmark = pytest.mark.usefixtures("no_pictures")
+
 
 @pytest.fixture
 def rows():

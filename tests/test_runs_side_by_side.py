@@ -13,6 +13,8 @@ from conftest import TOY, mlp_onnx
 import fdtasil
 from fdtasil.errors import FdtasilWarning
 
+pytestmark = pytest.mark.usefixtures("no_pictures")
+
 RUN = {
     "episodes": 2,
     "horizon": 20,
