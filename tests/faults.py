@@ -169,6 +169,7 @@ FAULTS = {
         138: "a system without what only Unix has",
         139: "a file of ours or of others that was mutated at random",
         140: "a file of the hub without a hash",
+        141: "a lock that a forked child keeps after its parent died",
     },
     "strange experts": {
         150: "an agent with its normalisation, or other wrappers, beside it",

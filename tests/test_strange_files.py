@@ -1010,3 +1010,30 @@ def test_a_lock_is_held_on_a_full_disk(tmp_path, monkeypatch):
 
 def test_the_pipeline_names_the_folder_absolutely():
     assert pipeline._folder_of("run", None) == Path.cwd() / "run"
+
+
+@pytest.mark.fault(141)
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+def test_a_forked_child_keeps_no_lock_of_a_dead_parent(tmp_path):
+    """Joblib's and torch's workers are such children, and may outlive a run that was killed."""
+    code = f"""
+import os, time
+from pathlib import Path
+from fdtasil.files.lock import locked
+with locked(Path({str(tmp_path / "run")!r})):
+    child = os.fork()
+    if child == 0:
+        time.sleep(60)
+        os._exit(0)
+    print(child, flush=True)
+    os._exit(1)  # killed
+"""
+    done = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
+    child = int(done.stdout.readline())
+    done.wait()
+    try:
+        os.kill(child, 0)  # it lives
+        with locked(tmp_path / "run"):
+            pass
+    finally:
+        os.kill(child, 9)

@@ -43,12 +43,30 @@ def locked(folder: Path, patience: float = 0.0) -> Iterator[None]:
     path = inside(folder, LOCK)
     made = not os.path.exists(folder)  # Path's own raises where a name is too long
     file = _wait_for(path, time.monotonic() + patience)
+    _OWN.add(file)
     try:
         yield
     finally:
-        _give_back(file, path)
+        if file in _OWN:  # a fork of this process has none
+            _OWN.remove(file)
+            _give_back(file, path)
         if made:
             remove_if_empty(folder)  # only a folder that nothing was written to is empty
+
+
+_OWN: set[int] = set()
+"""Descriptors of the locks that this process holds."""
+
+
+def _let_go() -> None:
+    """Close the locks of the parent in a forked child, which would hold them after its death."""
+    for file in tuple(_OWN):
+        os.close(file)
+    _OWN.clear()
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_let_go)
 
 
 def was_locked(folder: Path) -> bool:
