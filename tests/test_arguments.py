@@ -228,21 +228,32 @@ def test_who_reads_may_stop_reading(words):
 
 
 @pytest.mark.fault(191)
-@pytest.mark.parametrize("limit", [4, 6, 9])
-def test_few_descriptors_end_in_an_error_of_ours(limit, tmp_path):
-    code = f"""
-import resource, fdtasil
+def test_few_descriptors_end_in_an_error_of_ours(tmp_path):
+    """In a process that has loaded everything, and a fork of it for each number of them."""
+    code = """
+import os, resource, sys, torch
+torch.set_num_threads(1)
+import fdtasil
 from conftest import QUICK, TOY
 from test_arguments import linear
 fdtasil.distill(linear, TOY, 0, **QUICK, progress=False)
-resource.setrlimit(resource.RLIMIT_NOFILE, ({limit}, {limit}))
-try:
-    fdtasil.distill(linear, TOY, 0, **QUICK, progress=False, out={str(tmp_path / "run")!r})
-except fdtasil.FdtasilError as error:
-    print(error.next_step)
+for limit in (4, 6, 9):
+    if os.fork():
+        assert os.wait()[1] == 0, limit
+        continue
+    resource.setrlimit(resource.RLIMIT_NOFILE, (limit, limit))
+    out, code = f"{sys.argv[1]}/{limit}", 0
+    try:
+        fdtasil.distill(linear, TOY, 0, **QUICK, progress=False, out=out)
+    except fdtasil.FdtasilError as error:
+        print(limit, error.next_step, flush=True)
+    except BaseException as error:
+        print(limit, repr(error), file=sys.stderr, flush=True)
+        code = 1
+    os._exit(code)
 """
     done = subprocess.run(
-        [sys.executable, "-c", code],
+        [sys.executable, "-c", code, str(tmp_path)],
         capture_output=True,
         text=True,
         check=False,

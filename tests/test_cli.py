@@ -120,19 +120,18 @@ def test_every_argument_is_explained(name, inside, monkeypatch):
 
 
 def test_inspect_distill_evaluate(expert, inside, tmp_path):
-    """The middle one in a process of its own, as a user has it, and a baseline beside it."""
+    """With a baseline, in a process beside it; a distillation of its own process is below."""
     shown = inside("inspect", expert, TOY, "--episodes", 2)
     assert shown.returncode == 0, shown.stderr
     for promised in ("sha256", "determinism", "batch independence", "action bounds", "return"):
         assert promised in shown.stdout
-    done = shell("distill", expert, TOY, *QUICK, "--baseline", "--out", tmp_path / "run")
+    done = inside("distill", expert, TOY, *QUICK, "--baseline", "--out", tmp_path / "run")
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""  # no terminal, no bars
     for promised in ("expert", "plain cloning", "student", "queries: "):
         assert promised in done.stdout
     report = json.loads((tmp_path / "run" / "report.json").read_text())
     assert report["queries"]["probe"] == 400
-    assert (tmp_path / "run" / "figures" / "training.png").read_bytes().startswith(b"\x89PNG")
     judged = inside("evaluate", tmp_path / "run" / "student.onnx", TOY, "--expert", expert)
     assert judged.returncode == 0, judged.stderr
     assert "normalised return" in judged.stdout
@@ -308,8 +307,12 @@ def test_a_module_of_the_current_folder_and_a_warning_without_source(expert, tmp
     environment = {**os.environ, "PYTHONPATH": os.path.dirname(__file__)}
     done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=environment)
     assert done.returncode == 0, done.stderr
-    (line,) = done.stderr.splitlines()
+    (line,) = done.stderr.splitlines()  # no terminal, no bars
     assert line.startswith("fdtasil: warning: horizon=20")
+    for promised in ("expert", "student", "queries: ", "saved in "):
+        assert promised in done.stdout
+    picture = tmp_path / "runs" / "latest" / "figures" / "training.png"
+    assert picture.read_bytes().startswith(b"\x89PNG")
 
 
 def test_a_warning_is_one_line(expert, inside, tmp_path):

@@ -7,17 +7,19 @@ from pathlib import Path
 import pytest
 
 from fdtasil.shell.main import COMMANDS
+from fdtasil.student.fit import Fit
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
 BLOCKS = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
 
 
+@pytest.mark.usefixtures("no_pictures")
 def test_the_code_runs(tmp_path, monkeypatch):
     """All blocks in turn, as one session, in an empty folder beside the experts."""
     (tmp_path / "experts").symlink_to(ROOT / "experts")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr("fdtasil.student.fit._USUAL_STEPS", 200)  # for the same files
+    monkeypatch.setattr(Fit, "total_steps", lambda fit, states: 50)  # for the same files
     session = {}
     for block in BLOCKS:
         exec(compile(block, "README.md", "exec"), session)
