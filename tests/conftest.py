@@ -1,5 +1,7 @@
 """Toy experts with known derivatives, and ONNX files as users have them."""
 
+import functools
+import importlib.metadata
 import subprocess
 import sys
 import warnings
@@ -76,6 +78,14 @@ def figure(record_property):
 @pytest.fixture(autouse=True, scope="session")
 def one_thread():
     torch.set_num_threads(1)  # several test processes run at once
+
+
+@pytest.fixture(autouse=True, scope="session")
+def versions_are_read_once():
+    """Reading them out of packages is a third of a run of forty steps."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("fdtasil.run.report.version", functools.cache(importlib.metadata.version))
+        yield
 
 
 @pytest.fixture(autouse=True)
