@@ -4,13 +4,9 @@ import errno
 import itertools
 import json
 import os
-import pickle
 import random
-import select
 import shutil
 import signal
-import subprocess
-import sys
 import time
 from contextlib import suppress
 from pathlib import Path
@@ -18,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import QUICK, TOY, mlp_onnx
+from nursery import Nursery
 from test_resume import FILES, RUN, Stop, read, stop_at
 
 import fdtasil
@@ -30,83 +27,27 @@ pytestmark = pytest.mark.usefixtures("no_pictures")
 
 SHORT = {**QUICK, "probes": 2, "fit": Fit(steps=3)}
 
-# Forks a run for each line it reads: the imports, which take seconds, are done once.
-NURSERY = """
-import os, pickle, signal, sys, traceback
-import gymnasium, onnx, onnxruntime, scipy.stats, torch
-import torch._dynamo  # which an optimiser loads
-torch.set_num_threads(1)
-import fdtasil
-fdtasil.distill  # loaded when it is named
+CODE = """
 from fdtasil.results import figures
 from fdtasil.run import folder
 folder.CHECKPOINT_SECONDS = 0.05
 for name in ("training", "returns", "calibration"):
     setattr(figures, f"draw_{name}", lambda *drawn: b"no picture")
-for line in sys.stdin:
-    order = pickle.loads(bytes.fromhex(line))
-    child = os.fork()
-    if child == 0:
-        signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored in background jobs
-        code = 0
-        try:
-            fdtasil.distill(order.pop("expert"), order.pop("env"), progress=False, **order)
-        except (KeyboardInterrupt, SystemExit) as error:
-            print(getattr(error, "code", 130), *error.__notes__, file=sys.stderr, flush=True)
-            code = getattr(error, "code", 130)
-        except BaseException:
-            traceback.print_exc()
-            code = 1
-        os._exit(code)
-    print("begun", child, flush=True)
-    print("ended", os.waitstatus_to_exitcode(os.waitpid(child, 0)[1]), flush=True)
+
+def run(expert, env, **arguments):
+    try:
+        fdtasil.distill(expert, env, progress=False, **arguments)
+    except (KeyboardInterrupt, SystemExit) as error:
+        code = getattr(error, "code", 130)
+        print(code, *error.__notes__, file=sys.stderr, flush=True)
+        return code
+    return 0
 """
-
-
-class Nursery:
-    """Starts runs in processes of their own, one at a time."""
-
-    def __init__(self, errors):
-        self.errors = errors
-        environment = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
-        pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE, "stderr": errors.open("w")}
-        self._process = subprocess.Popen(
-            [sys.executable, "-c", NURSERY], env=environment, text=True, **pipes
-        )
-
-    def start(self, expert, **arguments):
-        """Start a run; return its process number."""
-        order = {"expert": str(expert), "env": TOY, **arguments}
-        self._process.stdin.write(pickle.dumps(order).hex() + "\n")
-        self._process.stdin.flush()
-        return self._told("begun")
-
-    def end(self):
-        """Wait for the run's end; return its exit code, negative for a signal."""
-        return self._told("ended")
-
-    def ends_within(self, seconds):
-        """Wait for the run's end, but not for long; return whether it has come."""
-        return bool(select.select([self._process.stdout], [], [], seconds)[0])
-
-    def _told(self, what):
-        """Return what is told next of that kind: a test that failed may not have waited.
-
-        An exit code of 0 that is taken for a process number would signal this whole group.
-        """
-        while True:
-            said, number = self._process.stdout.readline().split()
-            if said == what:
-                return int(number)
-
-    def close(self):
-        self._process.stdin.close()
-        self._process.wait(30)
 
 
 @pytest.fixture(scope="module")
 def nursery(tmp_path_factory):
-    made = Nursery(tmp_path_factory.mktemp("nursery") / "errors")
+    made = Nursery(CODE, tmp_path_factory.mktemp("nursery") / "errors")
     yield made
     made.close()
 
@@ -121,7 +62,7 @@ def golden(nursery, expert, tmp_path_factory):
     """The files of a run that was left alone, and how long it takes."""
     folder = tmp_path_factory.mktemp("golden") / "run"
     started = time.monotonic()
-    nursery.start(expert, out=folder, **RUN)
+    nursery.start(expert=expert, env=TOY, out=folder, **RUN)
     assert nursery.end() == 0
     return read(folder), time.monotonic() - started
 
@@ -155,7 +96,10 @@ def test_kills_at_random_moments(kills, nursery, expert, golden, tmp_path, figur
     while killed < kills:
         folder = tmp_path / f"run-{finished}"
         for attempt in itertools.count():
-            began, run = time.monotonic(), nursery.start(expert, **how(folder), **RUN)
+            began, run = (
+                time.monotonic(),
+                nursery.start(expert=expert, env=TOY, **how(folder), **RUN),
+            )
             if killed < kills and not nursery.ends_within(moments.uniform(0, length)):
                 with suppress(ProcessLookupError):
                     os.kill(run, signal.SIGKILL)
@@ -175,7 +119,7 @@ def test_kills_at_random_moments(kills, nursery, expert, golden, tmp_path, figur
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_waits_for_a_checkpoint(number, code, nursery, expert, golden, tmp_path):
     folder = tmp_path / "run"
-    run = nursery.start(expert, out=folder, **RUN)
+    run = nursery.start(expert=expert, env=TOY, out=folder, **RUN)
     wait_for(lambda: any(folder.glob("checkpoints/1/training-*")))
     sent = time.monotonic()
     os.kill(run, number)
@@ -183,7 +127,7 @@ def test_a_signal_waits_for_a_checkpoint(number, code, nursery, expert, golden, 
     assert time.monotonic() - sent < 10
     said = nursery.errors.read_text().splitlines()[-1]
     assert said == f'{code} what is done is kept: go on with resume="{folder}" (--resume {folder})'
-    nursery.start(expert, resume=folder, **RUN)
+    nursery.start(expert=expert, env=TOY, resume=folder, **RUN)
     assert nursery.end() == 0
     assert read(folder) == golden[0]
 
@@ -192,7 +136,7 @@ def test_a_signal_waits_for_a_checkpoint(number, code, nursery, expert, golden, 
 @pytest.mark.parametrize("way", ["out", "resume"])
 def test_a_folder_belongs_to_one_process(way, nursery, expert, golden, tmp_path):
     folder = tmp_path / "run"
-    run = nursery.start(expert, out=folder, **RUN)
+    run = nursery.start(expert=expert, env=TOY, out=folder, **RUN)
     wait_for(lambda: begun(folder))
     os.kill(run, signal.SIGSTOP)
     try:
@@ -206,11 +150,11 @@ def test_a_folder_belongs_to_one_process(way, nursery, expert, golden, tmp_path)
 
 @pytest.mark.fault(112)
 def test_the_lock_of_a_killed_process_is_taken_over(nursery, expert, tmp_path):
-    run = nursery.start(expert, out=tmp_path / "run", **RUN)
+    run = nursery.start(expert=expert, env=TOY, out=tmp_path / "run", **RUN)
     wait_for(lambda: (tmp_path / "run" / ".lock").exists())
     os.kill(run, signal.SIGKILL)
     nursery.end()
-    nursery.start(expert, **how(tmp_path / "run"), **RUN)
+    nursery.start(expert=expert, env=TOY, **how(tmp_path / "run"), **RUN)
     assert nursery.end() == 0
 
 

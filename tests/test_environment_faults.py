@@ -14,6 +14,7 @@ import numpy as np
 import pytest
 from conftest import GAIN, QUICK, TOY
 from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete, Tuple
+from nursery import Nursery
 from toy_environments import Integrator
 
 import fdtasil
@@ -467,35 +468,34 @@ def test_the_simulator_leaves_no_log_in_the_working_folder(tmp_path, monkeypatch
 # --- environments that take the process with them
 
 
-CHILD = """
-import ctypes, os, sys, time
-import torch
-torch.set_num_threads(1)
-import fdtasil
+CODE = """
+import ctypes, time
 from conftest import GAIN
 from test_environment_faults import RUN, Odd
-folder, how = sys.argv[1:]
-steps = []
-
-def fate(count, *answer):
-    steps.append(count)
-    if len(steps) == 100:  # of the second of three rounds
-        print("there", flush=True)
-        if how == "exit":
-            os._exit(3)
-        if how == "segfault":
-            ctypes.string_at(0)
-        if how == "hang":
-            time.sleep(3600)
-    return answer
 
 def linear(rows):
     return rows @ GAIN.T
 
-try:
-    fdtasil.distill(linear, lambda: Odd(step=fate), 2, out=folder, **RUN)
-except KeyboardInterrupt:
-    sys.exit(130)
+def run(folder, how):
+    steps = []
+
+    def fate(count, *answer):
+        steps.append(count)
+        if len(steps) == 100:  # of the second of three rounds
+            print("there", 0, flush=True)
+            if how == "exit":
+                os._exit(3)
+            if how == "segfault":
+                ctypes.string_at(0)
+            if how == "hang":
+                time.sleep(3600)
+        return answer
+
+    try:
+        fdtasil.distill(linear, lambda: Odd(step=fate), 2, out=folder, **RUN)
+    except KeyboardInterrupt:
+        return 130
+    return 0
 """
 RUN = {**QUICK, "trainer": "dagger", "episodes": 6}
 
@@ -514,8 +514,11 @@ def start(*arguments):
     )
 
 
-def child(folder, how):
-    return start("-c", CHILD, folder, how)
+@pytest.fixture(scope="module")
+def nursery(tmp_path_factory):
+    made = Nursery(CODE, tmp_path_factory.mktemp("nursery") / "errors")
+    yield made
+    made.close()
 
 
 def goes_on(folder):
@@ -533,24 +536,21 @@ def goes_on(folder):
 
 @pytest.mark.fault(72)
 @pytest.mark.parametrize(("how", "code"), [("exit", 3), ("segfault", -signal.SIGSEGV)])
-def test_a_process_that_an_environment_ends_leaves_whole_checkpoints(how, code, tmp_path):
-    process = child(tmp_path, how)
-    process.communicate(timeout=60)
-    assert process.returncode == code
+def test_a_process_that_an_environment_ends_leaves_whole_checkpoints(how, code, nursery, tmp_path):
+    nursery.start(folder=tmp_path, how=how)
+    assert nursery.end() == code, nursery.errors.read_text()
     goes_on(tmp_path)
 
 
 @pytest.mark.fault(73)
-def test_an_environment_that_hangs_is_ended_by_ctrl_c_and_the_run_goes_on(tmp_path):
-    process = child(tmp_path, "hang")
-    assert process.stdout.readline() == "there\n"
-    began = time.monotonic()
-    os.killpg(process.pid, signal.SIGINT)
-    process.communicate(timeout=20)
-    assert time.monotonic() - began < 5
-    assert process.returncode == 130
+def test_an_environment_that_hangs_is_ended_by_ctrl_c_and_the_run_goes_on(nursery, tmp_path):
+    run = nursery.start(folder=tmp_path, how="hang")
+    nursery.told("there")
+    os.killpg(run, signal.SIGINT)
+    assert nursery.ends_within(5)
+    assert nursery.end() == 130
     with pytest.raises(ProcessLookupError):
-        os.killpg(process.pid, 0)
+        os.killpg(run, 0)
     goes_on(tmp_path)
 
 
