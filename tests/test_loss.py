@@ -12,6 +12,7 @@ from fdtasil.probes.scales import measure_scales
 from fdtasil.probes.source import Probes
 from fdtasil.run.presets import PRESETS
 from fdtasil.student.architectures import Mlp
+from fdtasil.student.fit import Fit
 from fdtasil.student.loss import Minibatch, ProbeBatch, Weights, taylor_loss
 from fdtasil.student.policy import Student
 
@@ -35,7 +36,7 @@ def batch_of(module, spec, states, order=1):
     around = ProbeBatch(
         torch.from_numpy(answers.displacements[answers.numbers]),
         torch.from_numpy(answers.values),
-        answers.gain,
+        torch.from_numpy(answers.gains[answers.numbers]).float(),
     )
     labels = torch.from_numpy(expert.ask(states, "label"))
     return Minibatch(torch.from_numpy(states), labels, around), probes.stencil
@@ -47,12 +48,14 @@ def states():
 
 
 @pytest.mark.parametrize(
-    "spec", ["5", "basis,central", "orthogonal:4", "jacobian", "sphere:5,labels"]
+    "spec",
+    ["5", "basis,central", "orthogonal:4", "jacobian", "sphere:5,labels", "5,both,radius=0.1..2"],
 )
 def test_the_loss_is_zero_at_the_expert(states, spec):
     expert = smooth_expert()
     batch, stencil = batch_of(expert, spec, states)
-    loss = taylor_loss(expert, batch, stencil, Weights(0.5))
+    weights = Weights(0.5, moved=None if spec == "jacobian" else 1.0)
+    loss = taylor_loss(expert, batch, stencil, weights)
     assert float(loss.loss) < 1e-4
 
 
@@ -92,13 +95,44 @@ def test_labels_are_the_action_error_at_the_moved_states(states):
     with torch.no_grad():
         for parameter in student.parameters():
             parameter.mul_(0.8)
-    batch, stencil = batch_of(expert, "sphere:1,labels,radius=0.5", states)
-    loss = taylor_loss(student, batch, stencil, Weights(1.0))
+    batch, stencil = batch_of(expert, "sphere:1,labels,radius=0.5..3", states)
+    loss = taylor_loss(student, batch, stencil, Fit().weights("labels"))
     moved = batch.observations + batch.probes.displacements[:, 0]
     with torch.no_grad():
         error = (student(moved) - expert(moved)).norm(dim=-1).mean()
-    assert float(loss.derivative_error) == pytest.approx(float(error), rel=1e-4)
+    assert float(loss.moved_error) == pytest.approx(float(error), rel=1e-4)
+    assert float(loss.derivative_error) == 0
     assert float(loss.loss) == pytest.approx(float(loss.action_error + error), rel=1e-4)
+
+
+def test_both_are_the_sum_of_labels_and_differences(states):
+    """Each difference is measured in units of its own distance."""
+    expert, student = smooth_expert(), smooth_expert(m=3)
+    with torch.no_grad():
+        for parameter in student.parameters():
+            parameter.mul_(0.8)
+    batch, stencil = batch_of(expert, "sphere:1,both,radius=0.5..3", states)
+    weights = Fit(weight=0.25, moved_weight=2.0).weights("both")
+    loss = taylor_loss(student, batch, stencil, weights)
+    moved = batch.observations + batch.probes.displacements[:, 0]
+    with torch.no_grad():
+        here, there = (student(x) - expert(x) for x in (batch.observations, moved))
+        steps = (batch.probes.displacements[:, 0] / states.std(axis=0)).norm(dim=-1)
+        change = ((there - here).norm(dim=-1) * states.shape[1] ** 0.5 / steps).mean()
+    assert float(loss.derivative_error) == pytest.approx(float(change), rel=1e-4)
+    expected = here.norm(dim=-1).mean() + 0.25 * change + 2 * there.norm(dim=-1).mean()
+    assert float(loss.loss) == pytest.approx(float(expected), rel=1e-4)
+
+
+def test_distances_are_spread_evenly_over_their_orders_of_magnitude(states):
+    many = np.tile(states, (20, 1))
+    batch, _ = batch_of(smooth_expert(), "sphere:2,radius=0.01..1", many)
+    whitened = batch.probes.displacements / many.std(axis=0)
+    lengths = (whitened.norm(dim=-1) / states.shape[1] ** 0.5).flatten().numpy()
+    assert lengths.min() >= 0.0099
+    assert lengths.max() <= 1.01
+    shares = np.histogram(np.log10(lengths), bins=[-2.1, -1.5, -1, -0.5, 0.1])[0] / len(lengths)
+    assert shares == pytest.approx([0.25] * 4, abs=0.05)
 
 
 def test_second_differences_agree_with_exact_second_derivatives():

@@ -105,6 +105,9 @@ def test_every_difference_is_exact_on_a_line_and_of_its_order_on_a_parabola(sten
         "sphere:50,per_step=all",
         "basis,central,whitened,per_step=2",
         "orthogonal:all,central",
+        "fresh",
+        "fresh:20,labels,radius=0.1..1",
+        "10,both,central,radius=wide",
     ],
 )
 def test_a_spec_reads_back(spec):
@@ -118,6 +121,8 @@ def test_short_specs():
     assert Probes.parse(10) == Probes.parse("10") == Probes.parse("adaptive:10")
     assert Probes.parse("10,central") == Probes.parse("adaptive:10,central")
     assert Probes.parse("sphere") == Probes.parse("sphere:10")
+    assert Probes.parse("fresh") == Probes.parse("10,both,resample,radius=wide")
+    assert Probes.parse("fresh:3,differences") == Probes.parse("3,resample,radius=wide")
 
 
 @pytest.mark.fault(84, 86)
@@ -125,7 +130,9 @@ def test_short_specs():
     "spec",
     [-1, 2.0, True, "spere:3", "sphere:0", "sphere:x", "basis:3", "sphere:3,radius=0",
      "jacobian,central", "sphere:all", "sphere:3,radius=nan", "sphere:3,odd",
-     "sphere:3,per_step=0", "sphere:3,radius", ""],
+     "sphere:3,per_step=0", "sphere:3,radius", "", "fresh:0", "fresh,radius=2..1",
+     "fresh,radius=1..", "fresh,radius=0..1", "fresh,radius=1..2..3", "fresh,radius=far",
+     "jacobian,both"],
 )  # fmt: skip
 def test_a_wrong_spec_is_refused_with_an_example(spec):
     with pytest.raises(SettingError, match="next step"):

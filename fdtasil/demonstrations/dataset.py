@@ -22,7 +22,7 @@ from fdtasil.probes.source import Probes
 
 __all__ = ["Dataset", "DatasetLike", "check_dataset", "check_shapes", "load_dataset"]
 
-_VERSION = 1
+_VERSION = 2
 
 
 @dataclass(frozen=True)
@@ -54,11 +54,12 @@ class Dataset:
     def to_bytes(self) -> bytes:
         """Return the dataset as an npz file.
 
-        Schema, version 1, all little-endian and without pickles: `observations` (N, n) float32,
+        Schema, version 2, all little-endian and without pickles: `observations` (N, n) float32,
         `actions` (N, m) float32 (the expert's), `episode` (N,) and `round` (N,) int32, `taken`
         (N, m) float32, `rewards` (N,) float64 and `terminated` (N,) bool as in `Demonstrations`,
         `low` and `high` (m,) float32; with probes also `displacements` (P, n) float32, `numbers`
-        (N, k) int32, `values` (N, k, p, m) float32 and `gain` () float64 as in `Answers`; and
+        (N, k) int32, `values` (N, k, p, m) float32 and `gains` (P,) float64 as in `Answers` (one
+        `gain` () in version 1); and
         `about`, JSON text as bytes: version, environment, probes.
         """
         arrays: dict[str, Any] = dict(vars(self.demonstrations))
@@ -137,7 +138,15 @@ def check_dataset(dataset: Dataset) -> Dataset:
     """
     arrays = check_shapes(dataset)
     _check_bounds(dataset.low, dataset.high)
-    for name in ("observations", "actions", "taken", "displacements", "values", "rewards"):
+    for name in (
+        "observations",
+        "actions",
+        "taken",
+        "displacements",
+        "values",
+        "gains",
+        "rewards",
+    ):
         if name in arrays and not np.isfinite(arrays[name]).all():
             bad = np.flatnonzero([not np.isfinite(row).all() for row in arrays[name]])
             raise SettingError(
@@ -160,8 +169,8 @@ def check_shapes(dataset: Dataset) -> dict[str, np.ndarray]:
     shapes = {"observations": "Nn", "actions": "Nm", "taken": "Nm", "low": "m", "high": "m"}
     shapes |= dict.fromkeys(("episode", "round", "rewards", "terminated"), "N")
     if answers is not None:
-        arrays |= {name: getattr(answers, name) for name in ("displacements", "numbers", "values")}
-        shapes |= {"displacements": "Pn", "numbers": "Nk", "values": "Nkpm"}
+        arrays |= vars(answers)
+        shapes |= {"displacements": "Pn", "numbers": "Nk", "values": "Nkpm", "gains": "P"}
     sizes: dict[str, int] = {}
     for name in shapes:
         _check_kind(name, arrays[name])
@@ -221,7 +230,7 @@ _KINDS: dict[str, Any] = {
     **dict.fromkeys(("observations", "actions", "taken", "low", "high"), np.float32),
     **dict.fromkeys(("displacements", "values"), np.float32),
     **dict.fromkeys(("episode", "round", "numbers"), np.int32),
-    **dict.fromkeys(("rewards", "gain"), np.float64),
+    **dict.fromkeys(("rewards", "gain", "gains"), np.float64),
     "terminated": np.bool_,
 }
 """Types of the arrays, by name; those of others are turned into these where nothing is lost."""
@@ -253,10 +262,10 @@ def _read(arrays: Mapping[str, np.ndarray]) -> Dataset:
     answers = None
     if "values" in typed:
         bank, numbers, values = (typed[name] for name in ("displacements", "numbers", "values"))
-        gain = float(typed["gain"])
-        if not 0 < gain < np.inf:
-            raise ValueError(f"gain {gain}")
-        answers = Answers(bank, numbers, values, gain)
+        gains = typed["gains"] if "gains" in typed else np.full(len(bank), typed["gain"])
+        if not ((gains > 0) & (gains < np.inf)).all():
+            raise ValueError("gains that are not positive numbers")
+        answers = Answers(bank, numbers, values, gains)
     bounds = typed["low"], typed["high"]
     return Dataset(demonstrations, _probes(spec, answers), answers, *bounds, environment)
 

@@ -77,6 +77,7 @@ class Expert:
         columns: The coordinates that a student's file says it sees, or None.
         module: The same function as a differentiable torch module, or None; only the analytic
             reference (`probes="jacobian"`) uses it.
+        multiply_adds: At most how many a row takes, where the file says it; see `cost.py`.
         chunk: Rows asked at once.
         workers: Who answer chunks side by side instead of `answer`, or None; copies share them.
         queries: Rows answered so far, by purpose.
@@ -99,6 +100,7 @@ class Expert:
     queries: Counter[str] = field(default_factory=Counter)
     source: str | None = None
     columns: tuple[int, ...] | None = None
+    multiply_adds: int | None = None
 
     def ask(self, observations: np.ndarray, purpose: Purpose) -> np.ndarray:
         """Answer a batch and count its rows.

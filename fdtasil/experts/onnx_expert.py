@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 from torch.nn import Module
 
 from fdtasil.errors import ExpertError, shown
+from fdtasil.experts.cost import stored_numbers
 from fdtasil.experts.expert import Expert, Hints
 from fdtasil.experts.sizes import size_hint
 from fdtasil.experts.trial import try_out
@@ -50,7 +51,10 @@ def open_onnx(source: str | Path, hints: Hints) -> Expert:
     try_out(digest, str(path), call, straight=_is_straight(model))
     policy, n, m = open_policy(*call)
     twin = _twin(model, policy, n, path)
-    return Expert(policy, path.name, n, m, digest, twin, source=str(source), columns=columns)
+    # One that takes a row at a time costs as much as a slow one, however small it is.
+    work = None if policy.one_by_one else stored_numbers(model)
+    about = {"source": str(source), "columns": columns, "multiply_adds": work}
+    return Expert(policy, path.name, n, m, digest, twin, **about)
 
 
 def _declared_size(model: "onnx.ModelProto") -> int:

@@ -10,7 +10,7 @@ from torch import Tensor
 if TYPE_CHECKING:
     import onnx
 
-__all__ = ["torch_twin"]
+__all__ = ["OPERATORS", "torch_twin"]
 
 Operator = Callable[..., Tensor]
 

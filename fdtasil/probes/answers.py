@@ -36,17 +36,17 @@ class Answers:
         numbers: (N, k) int32, the rows of the bank that each state was probed along.
         values: (N, k, p, m) float32 expert actions at state + offset * displacement for each of
             the stencil's p offsets; for an exact stencil they are the p first derivatives.
-        gain: What turns a difference of values into the whitened Jacobian's Frobenius norm,
-            in expectation over directions: sqrt(d) / step; 1 where values are matched as labels.
+        gains: (P,) what turns a difference of values along each displacement into the whitened
+            Jacobian's Frobenius norm, in expectation over directions: sqrt(d) / step.
     """
 
     displacements: np.ndarray
     numbers: np.ndarray
     values: np.ndarray
-    gain: float
+    gains: np.ndarray
 
     def __add__(self, other: "Answers") -> "Answers":
-        """Join the answers of two rounds; the gain is the later one's.
+        """Join the answers of two rounds.
 
         A coordinate may begin to move in a later round, and a basis is longer by it then: states
         with fewer probes have some of them twice.
@@ -58,7 +58,7 @@ class Answers:
             np.concatenate([self.displacements, other.displacements]),
             np.concatenate([self.numbers[:, ours], later]),
             np.concatenate([self.values[:, ours], other.values[:, theirs]]),
-            other.gain,
+            np.concatenate([self.gains, other.gains]),
         )
 
 
@@ -144,26 +144,30 @@ def _ask_probes(
     deviation = 1.0 if probes.space == "raw" else scales.deviation
     step_scale = np.where(scales.probed(probes.space), deviation, 0.0)
     live = np.flatnonzero(step_scale)
-    assert probes.radius is not None, "the preset sets the radius"
     assert probes.stencil is not None, "the order sets the stencil"
-    reach = 1.0 if probes.space == "raw" else probes.directions.reach(len(live))
-    step = 1.0 if probes.stencil.exact else probes.radius * reach
+    near, far = (1.0, 1.0) if probes.exact else probes.reaches
+    reach = 1.0 if probes.space == "raw" or probes.exact else probes.directions.reach(len(live))
+    # Of one distance: states lie apart in its units. Of many: in units of one deviation.
+    step = reach * (near if near == far else 1.0)
     shown = np.linspace(0, len(observations) - 1, min(len(observations), _SHOWN)).astype(int)
     states = observations[shown][:, live] / (step * step_scale[live])
     count = probes.directions.count(len(live))
     _check_room(expert, probes, len(observations), observations.shape[1], count)
     bank, numbers = probes.directions.draw(len(observations), states, random)
+    steps = np.full((len(bank), 1), step)
+    if near != far:
+        steps *= np.exp(random.uniform(np.log(near), np.log(far), steps.shape))
     displacements = np.zeros((len(bank), len(step_scale)), np.float32)
     with np.errstate(over="ignore"):  # looked at in the next line
-        displacements[:, live] = step * bank * step_scale[live]
+        displacements[:, live] = steps * bank * step_scale[live]
     _check_steps(displacements, observations, probes)
-    gain = len(live) ** 0.5 / step if probes.stencil.differences else 1.0
+    gains = len(live) ** 0.5 / steps[:, 0]
     if probes.stencil.exact:
         values = differentiate(expert, observations, displacements, numbers, order)
     else:
         offsets = probes.stencil.offsets
         values = _ask_values(expert, observations, displacements, numbers, offsets, beginning)
-    return Answers(displacements, numbers, values, gain)
+    return Answers(displacements, numbers, values, gains)
 
 
 def _ask_values(
@@ -245,7 +249,7 @@ def _check_steps(displacements: np.ndarray, observations: np.ndarray, probes: Pr
     wide = np.abs(displacements).max() + np.abs(observations).max()
     if not np.isfinite(wide) or not sizes.any():
         raise SettingError(
-            f"radius={probes.radius:g} moves a state by {sizes.max():g}",
+            f"radius={probes.radius} moves a state by {sizes.max():g}",
             "steps that float32 can add to the observations",
             "leave radius= out, or write for example radius=0.3",
         )

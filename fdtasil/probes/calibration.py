@@ -14,7 +14,7 @@ from fdtasil.probes.scales import Scales
 from fdtasil.probes.source import Probes
 from fdtasil.probes.stencils import CENTRAL, FORWARD
 
-__all__ = ["Calibration", "Ladder", "calibrate", "ladder_for"]
+__all__ = ["WIDE", "Calibration", "Ladder", "calibrate", "ladder_for"]
 
 
 @dataclass(frozen=True)
@@ -52,6 +52,8 @@ _ROUGH = 0.62
 _ROUGH_RADIUS = 0.5
 _NOISY_FROM = 4.0**-6  # smallest radius with a derivative; float32 rounding stays below it
 _NOISY_SHARE = 0.3  # of noise in a difference; above it a given radius is warned of
+WIDE = (0.05, 2.0)
+"""The nearest and the farthest of the radii that teach well together, if an expert allows it."""
 _FAR = 4.0  # standard deviations beyond which no demonstrated state lies, and none was asked about
 
 
@@ -89,10 +91,23 @@ class Calibration:
     def complete(self, probes: Probes) -> Probes:
         """Return the source with what it leaves open filled in; warn of a radius that misleads."""
         radius = self.radius if probes.radius is None else probes.radius
-        if probes.radius is not None and probes.space == "whitened":
-            self._warn_of(probes.radius)
+        if radius == "wide":
+            radius = max(WIDE[0], self._nearest()), max(WIDE[1], self._nearest())
+        elif probes.radius is not None and probes.space == "whitened":
+            for end in sorted(set(replace(probes, radius=radius).reaches)):
+                self._warn_of(end)
         stencil = CENTRAL if self.stencil == "central" else FORWARD
         return replace(probes, radius=radius, stencil=probes.stencil or stencil)
+
+    def _nearest(self) -> float:
+        """Return the smallest radius at which differences say something of the expert."""
+        if self.regime == "steps":
+            return self.radius
+        told = [r for r, c in zip(self.radii, self.change, strict=True) if self._heard(c)]
+        return min(told, default=self.radius)
+
+    def _heard(self, change: float) -> bool:
+        return 2**0.5 * self.noise_floor <= _NOISY_SHARE * change
 
     def similarity_at(self, radius: float) -> float:
         """Return the similarity at a radius, interpolated between the rungs of the ladder."""

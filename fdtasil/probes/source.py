@@ -1,8 +1,8 @@
-"""A derivative source: directions, stencil, distance, and when to ask again."""
+"""A derivative source: directions, stencil, distance, what is matched, and when to ask again."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 from fdtasil.checks import check_choice, check_count, check_flag, check_number, spelt
 from fdtasil.errors import SettingError
@@ -14,9 +14,9 @@ from fdtasil.probes.directions import (
     RandomSphere,
     StandardBasis,
 )
-from fdtasil.probes.stencils import CENTRAL, EXACT, FORWARD, LABELS, Stencil
+from fdtasil.probes.stencils import CENTRAL, EXACT, FORWARD, Stencil
 
-__all__ = ["DIRECTIONS", "Probes"]
+__all__ = ["DIRECTIONS", "FRESH", "Match", "Probes", "Radius", "radius_text"]
 
 DIRECTIONS: dict[str, Any] = {
     design.name: design
@@ -25,18 +25,25 @@ DIRECTIONS: dict[str, Any] = {
 """Every design by the name it is written with."""
 
 
+Match = Literal["differences", "labels", "both"]
+"""What of the expert's answers a student is held to."""
+
+Radius = float | tuple[float, float] | Literal["wide"]
+"""One distance, or the nearest and the farthest of many."""
+
+
 @dataclass(frozen=True)
 class Probes:
-    """A derivative source: where to probe, how to difference, how far, and when to ask again.
+    """A derivative source: where to probe, how far, what is matched, and when to ask again.
 
     Attributes:
         directions: Where.
-        stencil: How: `FORWARD`, `CENTRAL`, `LABELS` (no difference: augmentation, the
-            baseline that benchmarks compare with), or `EXACT` (a differentiable expert only). None
+        stencil: How: `FORWARD`, `CENTRAL`, or `EXACT` (a differentiable expert only). None
             leaves it to the calibration, or is forward for first order and central for second.
         radius: How far. Whitened space: standard deviations moved by each coordinate that moves
-            (root mean square). Raw space: Euclidean length of the displacement.
-            None leaves it to the calibration, or to the preset.
+            (root mean square). Raw space: Euclidean length of the displacement. Two numbers:
+            each direction has a length of its own between them, log-uniform. "wide": from as near
+            as the expert allows, 0.05, to 2. None leaves it to the calibration, or to the preset.
         space: "whitened" scales each coordinate by its standard deviation over the
             demonstrations and freezes those that do not move; "raw" takes observations as they
             are. None leaves it to the preset.
@@ -44,6 +51,8 @@ class Probes:
             the stored answers have been used once.
         per_step: How many of a state's probes one visit of the state uses, or "all" (the cost of
             a training step then grows with their number). None leaves it to the preset.
+        match: "differences" between moved and demonstrated states; "labels", the answers at the
+            moved states as they are (data augmentation); or "both".
 
     Example:
         >>> Probes.parse("sphere:5,resample") == Probes(RandomSphere(5), resample=True)
@@ -54,17 +63,18 @@ class Probes:
 
     directions: Directions
     stencil: Stencil | None = None
-    radius: float | None = None
+    radius: Radius | None = None
     space: Literal["whitened", "raw"] | None = None
     resample: bool = False
     per_step: int | Literal["all"] | None = None
+    match: Match = "differences"
 
     def __post_init__(self) -> None:
         if self.radius is not None:
-            number = check_number("radius", self.radius, positive=True)
-            object.__setattr__(self, "radius", number)
+            object.__setattr__(self, "radius", _checked_radius(self.radius))
         if self.space is not None:
             check_choice("space", self.space, ("whitened", "raw"))
+        check_choice("match", self.match, _MATCHES)
         object.__setattr__(self, "resample", check_flag("resample", self.resample))
         if not isinstance(self.directions, tuple(DIRECTIONS.values())) or not isinstance(
             self.stencil, Stencil | None
@@ -81,6 +91,12 @@ class Probes:
                 "a finite stencil with asked directions, and none with differentiated ones",
                 'write probes="jacobian" for the exact derivative',
             )
+        if self.exact and self.match != "differences":
+            raise SettingError(
+                f"match={self.match!r} with exact derivatives",
+                "answers at moved states, of which there are none",
+                'write for example probes="10,both"',
+            )
         if self.per_step is not None and not _is_all(self.per_step):
             object.__setattr__(self, "per_step", check_count("per_step", self.per_step))
 
@@ -91,8 +107,10 @@ class Probes:
         Args:
             spec: 0 or "none" (plain behaviour cloning), N (N adaptive directions), or a text
                 `design[:count][,option...]`: designs adaptive (a mere number is one), basis,
-                sphere, orthogonal, jacobian; options forward, central, labels, resample,
-                whitened, raw, radius=R, per_step=K. A `Probes` is returned as it is.
+                sphere, orthogonal, jacobian, fresh; options forward, central, differences,
+                labels, both, resample, whitened, raw, radius=R, radius=LOW..HIGH, radius=wide,
+                per_step=K. "fresh" is "adaptive:10,both,resample,radius=wide". A `Probes` is
+                returned as it is.
 
         Returns:
             The source, or None for plain behaviour cloning.
@@ -116,9 +134,10 @@ class Probes:
         """Return the text that `parse` reads back, with the radius where it is set."""
         parts = [_describe(self.directions)]
         parts += [self.stencil.name] if self.stencil not in (None, EXACT) else []
+        parts += [self.match] if self.match != "differences" else []
         parts += ["resample"] if self.resample else []
         parts += [self.space] if self.space else []
-        parts += [f"radius={_shortest(self.radius)}"] if self.radius is not None else []
+        parts += [f"radius={radius_text(self.radius)}"] if self.radius is not None else []
         parts += [f"per_step={self.per_step}"] if self.per_step is not None else []
         return ",".join(parts)
 
@@ -126,6 +145,12 @@ class Probes:
     def exact(self) -> bool:
         """Whether the expert is differentiated, and not asked."""
         return self.stencil is not None and self.stencil.exact
+
+    @property
+    def reaches(self) -> tuple[float, float]:
+        """The nearest and the farthest distance, once the radius is known."""
+        assert isinstance(self.radius, int | float | tuple), "the preset sets the radius"
+        return self.radius if isinstance(self.radius, tuple) else (self.radius, self.radius)
 
     def with_order(self, order: int, usual: Stencil | None = FORWARD) -> "Probes":
         """Return the source with a stencil that has differences up to `order`.
@@ -137,7 +162,15 @@ class Probes:
         Raises:
             SettingError: If the stencil that was asked for has none of second order.
         """
+        if self.match != "differences":
+            usual = FORWARD  # a label needs no other side
         stencil = self.stencil or (CENTRAL if order == 2 else usual)
+        if order == 2 and self.match == "labels":
+            raise SettingError(
+                "order=2 with labels",
+                "second differences to match",
+                'write for example probes="10,central,both"',
+            )
         if order == 2 and stencil and not stencil.exact and stencil.second is None:
             raise SettingError(
                 f"order=2 with the {stencil.name} stencil",
@@ -173,22 +206,57 @@ def _is_all(value: object) -> bool:
     return isinstance(value, str) and value == "all"
 
 
+def _checked_radius(radius: object) -> Radius:
+    if isinstance(radius, str):
+        check_choice("radius", radius, ("wide",))
+        return "wide"
+    if not isinstance(radius, tuple | list):
+        return check_number("radius", radius, positive=True)
+    ends = tuple(check_number("radius", end, positive=True) for end in radius)
+    if len(ends) != 2 or not ends[0] <= ends[1]:
+        raise SettingError(
+            spelt("radius", radius), "the nearest and the farthest", "write radius=(0.05, 2)"
+        )
+    return ends
+
+
+def radius_text(radius: Radius) -> str:
+    """Return the text of a radius that `Probes.parse` reads back."""
+    if isinstance(radius, str):
+        return radius
+    ends = radius if isinstance(radius, tuple) else (radius,)
+    return "..".join(_shortest(end) for end in ends)
+
+
+def _read_radius(text: str) -> Radius:
+    if text == "wide":
+        return "wide"
+    ends = [float(end) for end in text.split("..")]
+    return ends[0] if len(ends) == 1 else tuple(ends)  # pyright: ignore[reportReturnType]
+
+
 def _shortest(number: float) -> str:
     """Return the shortest text that reads back as the same number."""
     text = f"{number:g}"
     return text if float(text) == number else repr(float(number))
 
 
+FRESH = "fresh"
+"""What asks anew, at many distances, as long as it trains."""
+_FRESH = {"match": "both", "resample": True, "radius": "wide"}
+
 _GRAMMAR = 'a number of probes, or a text like "sphere:10,resample", "basis,central", "jacobian"'
 _EXAMPLES = "write for example probes=10, or probes=0 for plain behaviour cloning"
+_MATCHES: tuple[Match, ...] = get_args(Match)
 _FLAGS: dict[str, tuple[str, object]] = {
-    **{stencil.name: ("stencil", stencil) for stencil in (FORWARD, CENTRAL, LABELS)},
+    **{stencil.name: ("stencil", stencil) for stencil in (FORWARD, CENTRAL)},
+    **{match: ("match", match) for match in _MATCHES},
     "resample": ("resample", True),
     "whitened": ("space", "whitened"),
     "raw": ("space", "raw"),
 }
 _NUMBERS: dict[str, Callable[[str], object]] = {
-    "radius": float,
+    "radius": _read_radius,
     "per_step": lambda text: text if text == "all" else int(text),
 }
 
@@ -201,9 +269,12 @@ def _describe(directions: Directions) -> str:
 def _parse_text(spec: str) -> Probes:
     design, *options = (part.strip() for part in spec.split(","))
     name, colon, count = (f"adaptive:{design}" if design.isdigit() else design).partition(":")
+    fields: dict[str, Any] = {}
+    if name == FRESH:
+        name, fields = AdaptiveDirections.name, dict(_FRESH)
     if name not in DIRECTIONS:
         number = not set(name) - set("-+.0123456789")
-        advice = _EXAMPLES if number else f"designs: {', '.join(DIRECTIONS)}"
+        advice = _EXAMPLES if number else f"designs: {', '.join([*DIRECTIONS, FRESH])}"
         raise SettingError(f"probes={spec!r}", _GRAMMAR, advice)
     design, counted = DIRECTIONS[name], "probes" in DIRECTIONS[name].__dataclass_fields__
     if colon and not counted:
@@ -213,7 +284,6 @@ def _parse_text(spec: str) -> Probes:
         directions = design(*counts)
     except ValueError:  # no number, or none that can be used
         raise SettingError(f"probes={spec!r}", _GRAMMAR, _EXAMPLES) from None
-    fields: dict[str, Any] = {}
     for option in options:
         fields |= _parse_option(option, spec)
     if directions.exact and "stencil" in fields:

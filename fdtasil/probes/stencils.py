@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass
 
-__all__ = ["CENTRAL", "EXACT", "FORWARD", "LABELS", "Stencil"]
+__all__ = ["CENTRAL", "EXACT", "FORWARD", "Stencil"]
 
 
 @dataclass(frozen=True)
@@ -17,7 +17,6 @@ class Stencil:
         second: Weights of the values, and last that of the centre, in the second difference;
             None where the stencil has none.
         exact: Whether the derivative is analytic, and no value is asked at all.
-        differences: Whether the values are differenced, and not matched as they are.
     """
 
     name: str
@@ -26,11 +25,8 @@ class Stencil:
     centre: float
     second: tuple[float, ...] | None = None
     exact: bool = False
-    differences: bool = True
 
 
 FORWARD = Stencil("forward", (1.0,), (1.0,), -1.0)
 CENTRAL = Stencil("central", (1.0, -1.0), (0.5, -0.5), 0.0, (1.0, 1.0, -2.0))
 EXACT = Stencil("exact", (), (), 0.0, exact=True)
-LABELS = Stencil("labels", (1.0,), (1.0,), 0.0, differences=False)
-"""No difference: the answers are labels of the moved states, as in data augmentation."""

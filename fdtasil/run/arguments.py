@@ -6,9 +6,10 @@ from fdtasil.checks import check_count, spelt
 from fdtasil.demonstrations.dataset import Dataset
 from fdtasil.demonstrations.trainers import BehaviourCloning, Trainer, trainer_of
 from fdtasil.errors import SettingError
+from fdtasil.experts.cost import CHEAP, multiply_adds
 from fdtasil.files.storage import sha256
 from fdtasil.probes.directions import USUAL_COUNT
-from fdtasil.probes.source import Probes
+from fdtasil.probes.source import FRESH, Probes
 from fdtasil.probes.stencils import FORWARD
 from fdtasil.rollouts.environments import resolve_horizon
 from fdtasil.rollouts.trials import fingerprint
@@ -33,6 +34,8 @@ class Arguments:
         given: The dataset, or None.
         preset: Where the defaults come from.
         probes: The derivative source, but for what a calibration finds; None for cloning.
+        anew: The source that is taken instead where the expert is cheap to ask; None where a
+            caller says which it is.
         trainer: Who acts in which round; None where the dataset is given.
         episodes: Number of demonstrations.
         horizon: T, or None for the environment's own.
@@ -48,6 +51,7 @@ class Arguments:
     given: Dataset | None
     preset: Preset
     probes: Probes | None
+    anew: Probes | None
     trainer: Trainer | None
     episodes: int
     horizon: int | None
@@ -66,8 +70,31 @@ class Arguments:
             SettingError: If the environment allows no such horizon.
             EnvironmentFault: If it fails in its first steps.
         """
-        given, source, expert = self.given, self.probes, subject.expert
-        stored = given is not None and given.answers is not None
+        usual = self._with_source(subject, self.probes)
+        if self.anew is None:
+            return usual
+        work = (
+            None
+            if subject.expert is None
+            else multiply_adds(subject.expert, usual.observation_size)
+        )
+        if work is None:
+            return replace(usual, reason="nobody can say what a query costs")
+        about = f"a query is {work:,} multiply-adds"
+        if work > CHEAP:
+            return replace(usual, reason=f"{about}, more than {CHEAP:,}")
+        fresh = self._with_source(subject, self.anew)
+        due = sum(fresh.predicted_queries().values())
+        if self.max_queries is not None and due > self.max_queries:
+            reason = (
+                f"asking anew takes {due:,} queries, more than max_queries={self.max_queries:,}"
+            )
+            return replace(usual, reason=reason)
+        return replace(fresh, reason=f"{about}, at most {CHEAP:,}")
+
+    def _with_source(self, subject: Subject, source: Probes | None) -> Configuration:
+        given, expert = self.given, subject.expert
+        stored = given is not None and given.answers is not None and source is self.probes
         calibrates = source is not None and self.preset.calibrates(source)
         horizon = resolve_horizon(self.horizon, subject.pool) if subject.pool else 0
         (start,) = episode_seeds(self.seed, "evaluation", 0, 1)
@@ -94,6 +121,7 @@ class Arguments:
             max_queries=self.max_queries,
             batch=expert.chunk if expert else 0,
             fingerprint=fingerprint(subject.pool, start) if subject.pool else None,
+            reason=None,
         )
 
 
@@ -119,11 +147,12 @@ def read_arguments(
         SettingError: If one can't be used, or two don't go together.
     """
     defaults = preset_of(preset)
-    fit = defaults.fit if fit is None else _checked_fit(fit)
+    fit, curved = defaults.fit if fit is None else _checked_fit(fit), callable(student_obs)
     return Arguments(
         given=given,
         preset=defaults,
-        probes=_source_of(probes, defaults, fit.order, given, curved=callable(student_obs)),
+        probes=_source_of(probes, defaults, fit.order, given, curved=curved),
+        anew=_source_anew(defaults, fit.order, given, curved=curved) if probes is None else None,
         trainer=_trainer_of(trainer, given),
         episodes=_episodes_of(episodes, given),
         horizon=None if horizon is None else check_count("horizon", horizon),
@@ -190,6 +219,19 @@ def _source_of(
             "leave probes= out, or record demonstrations of its own",
         )
     return _from_store(stored, order, given)
+
+
+def _source_anew(
+    preset: Preset, order: int, given: Dataset | None, *, curved: bool
+) -> Probes | None:
+    """Return the source that nobody asked for, but that teaches best where queries are cheap.
+
+    Stored answers that were asked once are what their owner wants to be used.
+    """
+    stored = given.probes if given is not None else None
+    if not preset.calibrated or (stored is not None and not stored.resample):
+        return None
+    return _source_of(FRESH, preset, order, None, curved=curved)
 
 
 def _from_store(stored: Probes, order: int, given: Dataset | None) -> Probes:

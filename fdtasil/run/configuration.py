@@ -45,6 +45,7 @@ class Configuration:
         batch: Rows that the expert is asked at once, at most.
         fingerprint: Of the environment; see `rollouts/trials.py`. None where there is none, or it
             does not repeat itself.
+        reason: Why the source is asked anew, or is not, where no caller says which it is.
     """
 
     expert: str | None
@@ -69,6 +70,7 @@ class Configuration:
     max_queries: int | None
     batch: int
     fingerprint: dict[str, Any] | None
+    reason: str | None
 
     def predicted_queries(self) -> dict[str, int]:
         """Return the rows that the run will ask the expert for, by purpose.
@@ -139,7 +141,7 @@ class Configuration:
             "trainer": describe_trainer(self.trainer) if self.trainer else "none",
             "probes": self.probes.describe() if self.probes else "none",
             "student": describe(self.student),
-            "fit": self.fit.to_json(),
+            "fit": self.fit.to_json(anew=self.probes is not None and self.probes.resample),
         }
         whole = {name: written.get(name, value) for name, value in vars(self).items()}
         return json.loads(
@@ -159,6 +161,7 @@ class Configuration:
             collected, episodes = collected + new, episodes + count
             held = round(self.fit.held_out(episodes) * length)
             once = probes.queries(1, self.observation_size, visits=1)
-            samples = probes.samples(self.observation_size, self.fit.visits(collected - held))
+            visits = self.fit.visits(collected - held, anew=probes.resample)
+            samples = probes.samples(self.observation_size, visits)
             total += once * new + once * collected * (samples - 1)
         return total

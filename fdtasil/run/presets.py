@@ -5,6 +5,7 @@ from typing import Any, Literal
 
 from fdtasil.checks import check_choice
 from fdtasil.probes.adaptive import AdaptiveDirections
+from fdtasil.probes.calibration import WIDE
 from fdtasil.probes.directions import RandomSphere
 from fdtasil.probes.source import Probes
 from fdtasil.student.fit import Fit
@@ -39,10 +40,12 @@ class Preset:
         probes = replace(probes, space=probes.space or self.space)
         if isinstance(probes.directions, AdaptiveDirections) and not self.calibrated:
             probes = replace(probes, directions=RandomSphere(probes.directions.probes))
-        radius = None if self.calibrates(probes) else self.radius
+        radius = probes.radius
+        if not self.calibrates(probes):
+            radius = {None: self.radius, "wide": WIDE}.get(radius, radius)
         return replace(
             probes,
-            radius=radius if probes.radius is None else probes.radius,
+            radius=radius,
             per_step=self.per_step if probes.per_step is None else probes.per_step,
         )
 

@@ -82,12 +82,13 @@ class _Dealer:
         turns = visit * self._used + torch.arange(self._used, device=self._device)
         columns = (self._offset[rows] + turns) % self._numbers.shape[1]
         rows = rows[:, None]
-        displacements = self._bank[self._numbers[rows, columns]]
-        return ProbeBatch(displacements, self._values[rows, columns], self._gain)
+        along = self._numbers[rows, columns]
+        return ProbeBatch(self._bank[along], self._values[rows, columns], self._gains[along])
 
     def _fill(self, number: int) -> None:
         answers = self._ask(number)
-        self._number, self._gain = number, answers.gain
+        self._number = number
+        self._gains = torch.from_numpy(answers.gains).float().to(self._device)
         self._bank = torch.from_numpy(answers.displacements).to(self._device)
         self._numbers = torch.from_numpy(np.ascontiguousarray(answers.numbers)).to(self._device)
         self._values = torch.from_numpy(answers.values).to(self._device)

@@ -15,7 +15,7 @@ from fdtasil.checks import check_count, check_number, check_share
 from fdtasil.demonstrations.states import Demonstrations
 from fdtasil.errors import SettingError
 from fdtasil.probes.answers import Answers
-from fdtasil.probes.source import Probes
+from fdtasil.probes.source import Match, Probes
 from fdtasil.student.batches import Batches
 from fdtasil.student.fit_state import FitState
 from fdtasil.student.loss import Minibatch, TaylorLoss, Weights, taylor_loss
@@ -24,8 +24,17 @@ from fdtasil.student.step import gradient_step
 
 __all__ = ["Fit", "Hooks", "fit", "hold_out"]
 
-# Where nobody says a length: so many steps for so many states, and more for more.
-_USUAL_STEPS, _USUAL_STATES = 4000, 1500
+# Where nobody says a length: so many steps up to so many states, and more for more. Answers that
+# are asked anew are never learnt by heart, and longer training goes on teaching.
+_USUAL, _ANEW = (4_000, 1_500), (12_000, 13_500)
+_NUMBERS = (
+    "learning_rate",
+    "weight_decay",
+    "epsilon",
+    "weight",
+    "curvature_weight",
+    "moved_weight",
+)
 _LOG_EVERY = 100  # steps between two entries of the history; reading a loss waits for the device
 
 
@@ -34,8 +43,8 @@ class Fit:
     """How a student is optimised: length, AdamW, the terms of the Taylor loss, validation.
 
     Attributes:
-        steps: Gradient steps of a round. Left out, 4,000, and beyond 1,500 states more, by the
-            square root of their number.
+        steps: Gradient steps of a round. Left out, 4,000, or 12,000 where the expert is asked
+            anew; beyond 1,500 states, or 13,500, more by the square root of their number.
         epochs: Visits of each state in a round, instead of steps.
         batch_size: States in a minibatch at most; an epoch's are of almost equal size.
         learning_rate: Peak learning rate of AdamW, with cosine decay to zero.
@@ -47,6 +56,7 @@ class Fit:
             expert's reaction to deviations of about half a standard deviation.
         curvature_weight: lambda_2, the weight of the error of the second differences, with order
             2.
+        moved_weight: Of the action error at the moved states, where a source matches labels.
         max_gradient_norm: Scale longer gradients to this norm; left out, they stay.
         validation: Share of the episodes held out, by which the best weights are chosen; 0 keeps
             the last weights. A round with a single episode holds none out.
@@ -70,6 +80,7 @@ class Fit:
     order: int = 1
     weight: float = 0.5
     curvature_weight: float = 0.125
+    moved_weight: float = 1.0
     max_gradient_norm: float | None = None
     validation: float = 0.0
     patience: int | None = None
@@ -78,7 +89,7 @@ class Fit:
         for name in ("steps", "epochs", "batch_size", "patience"):
             self._check(name, check_count)
         self._check("order", partial(check_count, most=2))
-        for name in ("learning_rate", "weight_decay", "epsilon", "weight", "curvature_weight"):
+        for name in _NUMBERS:
             usual = Fit.__dataclass_fields__[name].default
             positive = name == "learning_rate"
             self._check(name, partial(check_number, positive=positive, example=usual))
@@ -100,26 +111,41 @@ class Fit:
         if value is not None or Fit.__dataclass_fields__[name].default is not None:
             object.__setattr__(self, name, check(name, value))
 
-    def to_json(self) -> dict[str, Any]:
+    def to_json(self, *, anew: bool = False) -> dict[str, Any]:
         """Return the fields as plain JSON values, and the rule for a length that is left out."""
         rule: dict[str, Any] = {"steps_for": None}
         if self.steps is None and self.epochs is None:
-            rule = {"steps": _USUAL_STEPS, "steps_for": _USUAL_STATES}
+            rule = dict(zip(("steps", "steps_for"), _ANEW if anew else _USUAL, strict=True))
         return {**asdict(self), **rule}
+
+    def weights(self, match: Match) -> Weights:
+        """Return the weights of a loss that holds a student to answers in that way."""
+        labels, differences = match != "differences", match != "labels"
+        return Weights(
+            self.weight if differences else None,
+            self.curvature_weight if differences and self.order == 2 else None,
+            self.moved_weight if labels else None,
+        )
 
     def steps_an_epoch(self, states: int) -> int:
         """Return the minibatches that visit each of `states` states once."""
         return max(1, -(-states // self.batch_size))
 
-    def total_steps(self, states: int) -> int:
-        """Return the gradient steps of a training on `states` states."""
+    def total_steps(self, states: int, *, anew: bool = False) -> int:
+        """Return the gradient steps of a training.
+
+        Args:
+            states: Number of states.
+            anew: Whether the expert is asked anew on the way.
+        """
         if self.epochs is not None:
             return self.epochs * self.steps_an_epoch(states)
         if self.steps is not None:
             return self.steps
-        if states <= _USUAL_STATES:
-            return _USUAL_STEPS
-        grown = _USUAL_STEPS * (states / _USUAL_STATES) ** 0.5
+        usual, enough = _ANEW if anew else _USUAL
+        if states <= enough:
+            return usual
+        grown = usual * (states / enough) ** 0.5
         return _LOG_EVERY * round(grown / _LOG_EVERY)  # a last entry of a few steps tells little
 
     def held_out(self, episodes: int) -> int:
@@ -128,9 +154,9 @@ class Fit:
             return 0
         return min(max(1, round(self.validation * episodes)), episodes - 1)
 
-    def visits(self, states: int) -> int:
+    def visits(self, states: int, *, anew: bool = False) -> int:
         """Return how often each state is visited, the last incomplete epoch counted whole."""
-        return -(-self.total_steps(states) // self.steps_an_epoch(states))
+        return -(-self.total_steps(states, anew=anew) // self.steps_an_epoch(states))
 
 
 @dataclass(frozen=True)
@@ -178,8 +204,8 @@ def fit(
 
     Returns:
         One entry for each 100 steps: step, loss, action_error, derivative_error,
-        curvature_error (means since the last entry), and validation_loss (the loss itself where
-        nothing is held out).
+        curvature_error, moved_error (means since the last entry), and validation_loss (the loss
+        itself where nothing is held out).
 
     Raises:
         FitError: If a loss or a weight is not finite; the student is of no use then.
@@ -189,7 +215,8 @@ def fit(
     batches = Batches(demonstrations, probes, answers, random, device)
     training, held_out = hold_out(demonstrations, settings, random("held out"))
     per_epoch = settings.steps_an_epoch(len(training))
-    steps = settings.total_steps(len(training))
+    anew = probes is not None and probes.resample
+    steps = settings.total_steps(len(training), anew=anew)
     told.begin(steps)
     optimiser = torch.optim.AdamW(
         student.parameters(),
@@ -199,7 +226,7 @@ def fit(
         fused=True,
         capturable=device.type == "cuda",
     )
-    weights = Weights(settings.weight, settings.curvature_weight if settings.order == 2 else None)
+    weights = settings.weights(probes.match if probes else "differences")
     stencil = probes.stencil if probes else None
     # Taken once, of the first sample: two validations then differ by the student alone.
     parts = held_out.to(device).split(settings.batch_size)

@@ -18,13 +18,13 @@ class ProbeBatch:
     Attributes:
         displacements: (B, k, n) where each state is probed.
         values: (B, k, p, m) what the expert said there; see `Answers`.
-        gain: From `Answers`, so that the weights mean the same for every design, number of
-            probes and radius.
+        gains: (B, k) from `Answers`, so that the weights mean the same for every design, number
+            of probes and radius.
     """
 
     displacements: Tensor
     values: Tensor
-    gain: float
+    gains: Tensor
 
 
 @dataclass(frozen=True)
@@ -44,15 +44,17 @@ class Minibatch:
 
 @dataclass(frozen=True)
 class Weights:
-    """The weights of the loss's terms; that of the actions is 1.
+    """The weights of the loss's terms, None for those that it does not have; the actions' is 1.
 
     Attributes:
         derivative: lambda_1.
-        curvature: lambda_2, or None for a loss of first order.
+        curvature: lambda_2, in a loss of second order.
+        moved: Of the actions at the moved states.
     """
 
-    derivative: float
+    derivative: float | None
     curvature: float | None = None
+    moved: float | None = None
 
 
 class TaylorLoss(NamedTuple):
@@ -65,12 +67,15 @@ class TaylorLoss(NamedTuple):
             whitened Jacobian's Frobenius norm; 0 without probes.
         curvature_error: (), mean norm of the error of the second differences, in units of z'Hz
             for standard normal z in whitened coordinates; 0 in a loss of first order.
+        moved_error: (), mean norm of the action error at the moved states, in units of the
+            actions; 0 where these answers are not matched as labels.
     """
 
     loss: Tensor
     action_error: Tensor
     derivative_error: Tensor
     curvature_error: Tensor
+    moved_error: Tensor
 
 
 def taylor_loss(
@@ -102,23 +107,44 @@ def taylor_loss(
     if stencil is None or probes is None:
         action = _mean_norm(student(batch.observations) - batch.actions, units)
         zero = torch.zeros_like(action)
-        return TaylorLoss(action, action, zero, zero)
-    errors = _exact_errors if stencil.exact else _difference_errors
-    found = errors(student, batch, probes, stencil, second=weights.curvature is not None)
-    count = probes.displacements.shape[1]
-    action = _mean_norm(found[0], units)
-    derivative = probes.gain / count**0.5 * _mean_norm(found[1], units)
-    total, curvature = action + weights.derivative * derivative, torch.zeros_like(action)
+        return TaylorLoss(action, action, zero, zero, zero)
+    errors = _exact_errors if stencil.exact else _asked_errors
+    found = errors(student, batch, probes, stencil, weights)
+    count, gains = probes.displacements.shape[1], probes.gains[..., None]
+    action = _mean_norm(found.action, units)
+    total, zero = action, torch.zeros_like(action)
+    derivative = curvature = moved = zero
+    if weights.derivative is not None:
+        derivative = _mean_norm(gains * found.first, units) / count**0.5
+        total = total + weights.derivative * derivative
     if weights.curvature is not None:
-        curvature = probes.gain**2 / count**0.5 * _mean_norm(found[2], units)
+        curvature = _mean_norm(gains**2 * found.second, units) / count**0.5
         total = total + weights.curvature * curvature
-    return TaylorLoss(total, action, derivative, curvature)
+    if weights.moved is not None:
+        moved = _mean_norm(found.moved, units) / (count * len(stencil.offsets)) ** 0.5
+        total = total + weights.moved * moved
+    return TaylorLoss(total, action, derivative, curvature, moved)
 
 
-def _difference_errors(
-    student: nn.Module, batch: Minibatch, probes: ProbeBatch, stencil: Stencil, *, second: bool
-) -> tuple[Tensor, ...]:
-    """Return the errors (B, m) at the states, and (B, k, m) of the first (and second) ones."""
+class _Errors(NamedTuple):
+    """A student's errors; any of them stand where a loss has no use for some.
+
+    Attributes:
+        action: (B, m) at the states.
+        moved: (B, k, p, m) at the moved states.
+        first: (B, k, m) of the first differences or derivatives.
+        second: (B, k, m) of the second ones.
+    """
+
+    action: Tensor
+    moved: Tensor
+    first: Tensor
+    second: Tensor
+
+
+def _asked_errors(
+    student: nn.Module, batch: Minibatch, probes: ProbeBatch, stencil: Stencil, weights: Weights
+) -> _Errors:
     (rows, n), values = batch.observations.shape, probes.values
     # Numbers, not tensors of them: a tensor would wait for the GPU at every step.
     moved = torch.stack([offset * probes.displacements for offset in stencil.offsets], dim=2)
@@ -135,18 +161,20 @@ def _difference_errors(
             total = total + weight * errors
         return total
 
-    first = difference(stencil.weights, stencil.centre)
-    if not second or stencil.second is None:
-        return action_error, first
-    *around, centre = stencil.second
-    return action_error, first, difference(tuple(around), centre)
+    first = second = value_errors
+    if weights.derivative is not None:
+        first = difference(stencil.weights, stencil.centre)
+    if weights.curvature is not None and stencil.second is not None:
+        *around, centre = stencil.second
+        second = difference(tuple(around), centre)
+    return _Errors(action_error, value_errors, first, second)
 
 
 def _exact_errors(
-    student: nn.Module, batch: Minibatch, probes: ProbeBatch, stencil: Stencil, *, second: bool
-) -> tuple[Tensor, ...]:
-    """Return the errors (B, m) at the states, and (B, k, m) of the exact derivatives."""
+    student: nn.Module, batch: Minibatch, probes: ProbeBatch, stencil: Stencil, weights: Weights
+) -> _Errors:
     (_, count, _), values = probes.displacements.shape, probes.values
+    second = weights.curvature is not None
     states = batch.observations.repeat_interleave(count, dim=0)
     along = _second_derivative_along if second else _derivative_along
     answers, *derivatives = along(student, states, probes.displacements.flatten(0, 1))
@@ -155,7 +183,7 @@ def _exact_errors(
         derivative.reshape(values[:, :, 0].shape) - values[:, :, order]
         for order, derivative in enumerate(derivatives)
     ]
-    return action_error, *errors
+    return _Errors(action_error, action_error, errors[0], errors[-1])
 
 
 def _derivative_along(

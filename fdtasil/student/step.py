@@ -78,7 +78,7 @@ class _Replayed:
         if self._eager:
             self._eager -= 1
             return self._aside(batch)
-        key = batch.probes and batch.probes.gain, *(tensor.shape for tensor in tensors_of(batch))
+        key = tuple(tensor.shape for tensor in tensors_of(batch))
         if key not in self._recordings:
             self._recordings[key] = self._record(batch)
         recording = self._recordings[key]
@@ -107,7 +107,7 @@ class _Replayed:
 def tensors_of(batch: Minibatch) -> tuple[Tensor, ...]:
     """Return all tensors of a minibatch, in an order that its kind alone decides."""
     probes = batch.probes
-    around = () if probes is None else (probes.displacements, probes.values)
+    around = () if probes is None else (probes.displacements, probes.values, probes.gains)
     return batch.observations, batch.actions, *around
 
 
@@ -115,6 +115,6 @@ def copy_of(batch: Minibatch) -> Minibatch:
     """Return a minibatch with tensors of its own."""
     probes = batch.probes
     if probes is not None:
-        values = probes.values.clone()
-        probes = ProbeBatch(probes.displacements.clone(), values, probes.gain)
+        copies = (probes.displacements, probes.values, probes.gains)
+        probes = ProbeBatch(*(tensor.clone() for tensor in copies))
     return Minibatch(batch.observations.clone(), batch.actions.clone(), probes)

@@ -127,7 +127,7 @@ class View:
         """
         if self.columns is not None:
             bank = np.ascontiguousarray(whole.displacements[:, list(self.columns)])
-            return Answers(bank, whole.numbers, whole.values, whole.gain)
+            return replace(whole, displacements=bank)
         if self.size == states.shape[1] and np.array_equal(self.look(states), states):
             return whole
         centres, moved = self.look(states), whole.displacements[whole.numbers]
@@ -142,7 +142,8 @@ class View:
             )
         bank = steps[0].reshape(-1, self.size).astype(np.float32)
         numbers = np.arange(len(bank), dtype=np.int32).reshape(whole.numbers.shape)
-        return Answers(bank, numbers, whole.values, whole.gain)
+        gains = whole.gains[whole.numbers].reshape(-1)
+        return Answers(bank, numbers, whole.values, gains)
 
     def _step(self, states: np.ndarray, centres: np.ndarray, moved: np.ndarray) -> np.ndarray:
         points = states[:, None, :] + moved

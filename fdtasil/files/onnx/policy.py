@@ -59,6 +59,11 @@ class OnnxPolicy:
     def __reduce__(self) -> tuple[type["OnnxPolicy"], tuple[bytes, str, str, int, int | None]]:
         return OnnxPolicy, self._arguments
 
+    @property
+    def one_by_one(self) -> bool:
+        """Whether the model takes one row at a time."""
+        return self._rows in (0, 1)
+
     def __call__(self, observations: np.ndarray) -> np.ndarray:
         """(B, n) float32 -> (B, m) float32."""
         if self._rows is None:

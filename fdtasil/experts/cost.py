@@ -1,0 +1,125 @@
+"""What a query of an expert costs, as its kind and size say, and never as a clock does."""
+
+from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING, Any
+
+import torch
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils.flop_counter import FlopCounterMode
+
+from fdtasil.experts.expert import Expert
+from fdtasil.experts.twin import OPERATORS
+
+if TYPE_CHECKING:
+    import onnx
+
+__all__ = ["CHEAP", "multiply_adds", "stored_numbers"]
+
+CHEAP = 2**20
+"""Multiply-adds a row up to which a million queries take less than a minute of one core."""
+
+_MANY = 500  # operations: each takes microseconds, whatever it computes
+
+# Operators that use each number of the file at most once for a row: those of an MLP, and others.
+_ONCE = OPERATORS.keys() | {
+    "ArgMax",
+    "BatchNormalization",
+    "DequantizeLinear",
+    "DynamicQuantizeLinear",
+    "Gather",
+    "LayerNormalization",
+    "MatMulInteger",
+    "Pow",
+    "QGemm",
+    "QLinearMatMul",
+    "QuantizeLinear",
+    "ReduceMean",
+    "ReduceSum",
+    "Reshape",
+    "Softmax",
+    "Split",
+    "Squeeze",
+    "Transpose",
+    "TreeEnsemble",
+    "TreeEnsembleClassifier",
+    "TreeEnsembleRegressor",
+    "Unsqueeze",
+    "Where",
+}
+
+
+def multiply_adds(expert: Expert, observation_size: int) -> int | None:
+    """Return at most how many multiply-adds one row takes.
+
+    Args:
+        expert: The expert.
+        observation_size: n.
+
+    Returns:
+        The number, or None where kind and size do not say it: functions, servers, workers, and
+        networks with loops or memory.
+
+    Example:
+        >>> multiply_adds(Expert(lambda rows: rows, "a function"), 3) is None
+        True
+    """
+    if expert.workers is not None:
+        return None
+    if expert.multiply_adds is not None or expert.module is None:
+        return expert.multiply_adds
+    return _counted(expert.module, observation_size)
+
+
+def stored_numbers(model: "onnx.ModelProto") -> int | None:
+    """Return how many numbers an ONNX model holds, or None if it may use them many times a row."""
+    nodes = model.graph.node
+    if model.functions or len(nodes) > _MANY or not {n.op_type for n in nodes} <= _ONCE:
+        return None
+    held = sum(_product(tensor.dims) for tensor in model.graph.initializer)
+    for node in nodes:
+        for entry in node.attribute:
+            held += max(len(entry.floats), len(entry.ints), _product(entry.t.dims))
+    return held
+
+
+def _product(sizes: Iterable[int]) -> int:
+    product = 1
+    for size in sizes:
+        product *= size
+    return product
+
+
+def _counted(module: torch.nn.Module, observation_size: int) -> int | None:
+    """Return what a module does for one row, counted while it does it."""
+    like = next(module.parameters(), torch.zeros(()))
+    row = torch.zeros((1, observation_size), device=like.device, dtype=like.dtype)
+    operations, products = _Operations(), FlopCounterMode(display=False)
+    try:
+        with torch.no_grad(), products, operations:
+            module(row)
+    except Exception:  # of the module, which says so itself when it is asked
+        return None
+    if operations.count > _MANY:
+        return None
+    return products.get_total_flops() // 2 + operations.numbers
+
+
+class _Operations(TorchDispatchMode):
+    """Counts the operations inside a block, and the numbers that they return."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.count = self.numbers = 0
+
+    def __torch_dispatch__(
+        self,
+        func: Callable[..., Any],
+        types: object,
+        args: tuple[Any, ...] = (),
+        kwargs: dict[str, Any] | None = None,
+    ) -> Any:
+        result = func(*args, **(kwargs or {}))
+        self.count += 1
+        if isinstance(result, torch.Tensor):
+            self.numbers += result.numel()
+        return result
