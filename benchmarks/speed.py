@@ -20,6 +20,7 @@ from fdtasil.experts.load import load_expert
 from fdtasil.probes.answers import Answers, ask_probes
 from fdtasil.probes.scales import measure_scales
 from fdtasil.probes.source import Probes
+from fdtasil.probes.surroundings import Surroundings
 from fdtasil.rollouts.behaviours import follow
 from fdtasil.rollouts.environments import EnvironmentPool
 from fdtasil.rollouts.rollout import rollout
@@ -114,9 +115,11 @@ def _task(
         student = Student(Mlp((HIDDEN, HIDDEN)), scales.mean, scales.scale, -ones, ones, start)
         fit(student.to(device), demonstrations, probes, ask if probes else None, settings, stream)
 
+    around = Surroundings.of(observations, probes, scales) if probes else None
+
     def asked(sample: int) -> Answers:
-        assert probes is not None
-        return ask_probes(expert, observations, probes, scales, np.random.default_rng(sample))
+        assert around is not None
+        return ask_probes(expert, around, np.random.default_rng(sample))
 
     # Stored answers are asked once for a whole training, of which this is a short piece.
     stored = asked(0) if probes else None

@@ -15,6 +15,7 @@ from fdtasil.experts.load import load_expert
 from fdtasil.probes.answers import ask_probes
 from fdtasil.probes.scales import measure_scales
 from fdtasil.probes.source import Probes
+from fdtasil.probes.surroundings import Surroundings
 from fdtasil.run.presets import PRESETS
 
 
@@ -94,7 +95,7 @@ def test_a_linear_experts_jacobian_is_exact(rows):
         .with_order(1)
     )
     expert, scales = load_expert(lambda x: x @ GAIN.T), measure_scales(rows)
-    answers = ask_probes(expert, rows, probes, scales, np.random.default_rng(0))
+    answers = ask_probes(expert, Surroundings.of(rows, probes, scales), np.random.default_rng(0))
     steps = answers.displacements.sum(axis=1)
     jacobian = (answers.values[:, :, 0] - expert.ask(rows, "label")[:, None]) / steps[:, None]
     assert np.allclose(jacobian, GAIN.T, atol=2e-5)
@@ -240,13 +241,9 @@ def test_the_twin_agrees_and_is_differentiable(tmp_path, rows):
     assert np.allclose(
         expert.module(torch.from_numpy(rows)).numpy(), expert.ask(rows, "check"), atol=1e-6
     )
-    found = ask_probes(
-        expert,
-        rows,
-        PRESETS["standard"].complete(Probes.parse("jacobian")).with_order(1),
-        measure_scales(rows),
-        np.random.default_rng(0),
-    )
+    probes = PRESETS["standard"].complete(Probes.parse("jacobian")).with_order(1)
+    around = Surroundings.of(rows, probes, measure_scales(rows))
+    found = ask_probes(expert, around, np.random.default_rng(0))
     assert found.values.shape == (37, 5, 1, 2)
     assert "probe" not in expert.queries
 
@@ -256,7 +253,9 @@ def test_a_graph_without_a_twin_says_so(tmp_path, rows):
     assert expert.module is None
     probes = PRESETS["standard"].complete(Probes.parse("jacobian")).with_order(1)
     with pytest.raises(ExpertError, match="can't be differentiated"):
-        ask_probes(expert, rows, probes, measure_scales(rows), np.random.default_rng(0))
+        ask_probes(
+            expert, Surroundings.of(rows, probes, measure_scales(rows)), np.random.default_rng(0)
+        )
 
 
 def test_what_the_actions_do_not_depend_on_is_no_part_of_the_twin(tmp_path, rows):

@@ -10,6 +10,7 @@ from fdtasil.experts.load import load_expert
 from fdtasil.probes.answers import ask_probes
 from fdtasil.probes.scales import measure_scales
 from fdtasil.probes.source import Probes
+from fdtasil.probes.surroundings import Surroundings
 from fdtasil.run.presets import PRESETS
 from fdtasil.student.architectures import Mlp
 from fdtasil.student.fit import Fit
@@ -32,7 +33,8 @@ def batch_of(module, spec, states, order=1):
     )
     expert = load_expert(module, states.shape[1])
     random = np.random.default_rng(0)
-    answers = ask_probes(expert, states, probes, measure_scales(states), random, order)
+    around = Surroundings.of(states, probes, measure_scales(states))
+    answers = ask_probes(expert, around, random, order)
     around = ProbeBatch(
         torch.from_numpy(answers.displacements[answers.numbers]),
         torch.from_numpy(answers.values),

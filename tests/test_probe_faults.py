@@ -17,6 +17,7 @@ from fdtasil.experts.load import load_expert
 from fdtasil.probes.answers import ask_probes
 from fdtasil.probes.scales import measure_scales
 from fdtasil.probes.source import Probes
+from fdtasil.probes.surroundings import Surroundings
 from fdtasil.run.presets import PRESETS
 
 BOX = Box(-np.inf, np.inf, (5,), np.float64)
@@ -30,7 +31,8 @@ def seen_through(change, box=BOX):
 def asked(expert, states, spec, seed=0):
     probes = PRESETS["standard"].complete(Probes.parse(spec)).with_order(1)
     scales = measure_scales(states)
-    return ask_probes(load_expert(expert), states, probes, scales, np.random.default_rng(seed))
+    around = Surroundings.of(states, probes, scales)
+    return ask_probes(load_expert(expert), around, np.random.default_rng(seed))
 
 
 def never(rows):

@@ -26,12 +26,12 @@ def states(dimension, physical=None):
 
 def test_half_the_adaptive_directions_are_excursions_where_observations_are_redundant():
     redundant = states(20, physical=3)
-    bank, _ = AdaptiveDirections(10).draw(300, redundant, np.random.default_rng(0))
+    bank, _ = AdaptiveDirections(10).around(redundant)(300, np.random.default_rng(0))
     basis = np.linalg.svd(redundant, full_matrices=False)[2][:3]
     possible = np.linalg.norm(bank @ basis.T, axis=1) > 0.999 * np.linalg.norm(bank, axis=1)
     assert 0.45 < possible.mean() < 0.55
     assert np.allclose(np.linalg.norm(bank[~possible], axis=1), 1)
-    free, _ = AdaptiveDirections(10).draw(300, states(20), np.random.default_rng(0))
+    free, _ = AdaptiveDirections(10).around(states(20))(300, np.random.default_rng(0))
     assert np.allclose(np.linalg.norm(free, axis=1), 1)
 
 
@@ -46,13 +46,13 @@ def test_few_states_say_nothing_of_redundant_directions():
 @pytest.mark.parametrize("design", DIRECTIONS)
 def test_every_design_keeps_the_contract(design, rows, dimension):
     directions = design_of(design, 7)
-    bank, numbers = directions.draw(rows, states(dimension), np.random.default_rng(0))
+    bank, numbers = directions.around(states(dimension))(rows, np.random.default_rng(0))
     assert bank.shape[1] == dimension
     assert numbers.shape == (rows, directions.count(dimension))
     assert np.allclose(np.linalg.norm(bank, axis=1), 1)
     assert numbers.min() >= 0
     assert numbers.max() < len(bank)
-    again = directions.draw(rows, states(dimension), np.random.default_rng(0))
+    again = directions.around(states(dimension))(rows, np.random.default_rng(0))
     assert np.array_equal(bank, again[0])
     assert np.array_equal(numbers, again[1])
 
@@ -62,21 +62,21 @@ def test_the_mean_square_of_a_derivative_is_the_jacobians(design):
     """E over directions of d |J u|^2 is |J|_F^2: what makes one weight fit every design."""
     jacobian = np.random.default_rng(1).standard_normal((3, 6))
     directions = design_of(design, 12)
-    bank, numbers = directions.draw(600, states(6), np.random.default_rng(0))
+    bank, numbers = directions.around(states(6))(600, np.random.default_rng(0))
     squares = 6 * ((bank[numbers] @ jacobian.T) ** 2).sum(axis=-1)
     assert squares.mean() == pytest.approx((jacobian**2).sum(), rel=0.05)
 
 
 @pytest.mark.fault(85)
 def test_a_state_is_never_probed_along_the_same_direction_twice():
-    _, sphere = RandomSphere(50).draw(3000, states(4), np.random.default_rng(0))
-    _, frames = OrthogonalFrames(50).draw(3000, states(4), np.random.default_rng(0))
+    _, sphere = RandomSphere(50).around(states(4))(3000, np.random.default_rng(0))
+    _, frames = OrthogonalFrames(50).around(states(4))(3000, np.random.default_rng(0))
     for numbers in (sphere, frames[:, :4]):
         assert all(len(set(row)) == len(row) for row in numbers.tolist())
 
 
 def test_a_whole_frame_is_orthonormal():
-    bank, numbers = OrthogonalFrames(None).draw(9, states(5), np.random.default_rng(0))
+    bank, numbers = OrthogonalFrames(None).around(states(5))(9, np.random.default_rng(0))
     for frame in bank[numbers]:
         assert np.allclose(frame @ frame.T, np.eye(5), atol=1e-12)
 
@@ -151,5 +151,5 @@ def test_a_system_at_rest_has_no_probes_of_no_length():
     settling = np.stack([0.9**time, 0.5**time], axis=1).round(6)
     states = (settling @ np.random.default_rng(0).standard_normal((2, 12))).astype(np.float32)
     assert is_redundant(states)
-    bank, _ = AdaptiveDirections(10).draw(len(states), states, np.random.default_rng(1))
+    bank, _ = AdaptiveDirections(10).around(states)(len(states), np.random.default_rng(1))
     assert np.linalg.norm(bank, axis=1).min() > 0.01

@@ -20,6 +20,7 @@ from fdtasil.probes.directions import Jacobian, OrthogonalFrames
 from fdtasil.probes.scales import measure_scales
 from fdtasil.probes.source import DIRECTIONS, Probes
 from fdtasil.probes.stencils import CENTRAL, EXACT, FORWARD
+from fdtasil.probes.surroundings import Surroundings
 from fdtasil.run.presets import PRESETS
 from fdtasil.seeding import torch_generator
 from fdtasil.student.architectures import ACTIVATIONS, Mlp
@@ -70,7 +71,8 @@ def test_a_linear_experts_jacobian_is_exact(design, stencil, sizes, exponents, o
     preset = PRESETS["standard"]
     probes = replace(preset, calibrated=False).complete(Probes.parse(f"{design},{stencil}"))
     found = measure_scales(states)
-    answers = ask_probes(expert, states, probes, found, np.random.default_rng(0))
+    around = Surroundings.of(states, probes, found)
+    answers = ask_probes(expert, around, np.random.default_rng(0))
     assert np.isfinite(answers.values).all()
     live = np.flatnonzero(found.live)
     assert answers.numbers.shape == (50, len(live))
@@ -130,7 +132,7 @@ def test_probes_are_never_fewer_than_asked_for(design, rows, dimension, count, m
     directions = Probes.parse(design if fixed else f"{design}:{count}").directions
     moving = min(moving, dimension)
     states = random_array(seed, (60, moving)) @ random_array(seed + 1, (moving, dimension))
-    bank, numbers = directions.draw(rows, states, np.random.default_rng(seed))
+    bank, numbers = directions.around(states)(rows, np.random.default_rng(seed))
     assert numbers.shape == (rows, dimension if fixed else count)
     assert np.isfinite(bank).all()
     assert np.linalg.norm(bank, axis=1).min() > 0

@@ -24,7 +24,7 @@ def test_a_probe_design_is_written_as_it_is_read(name):
     probes = Probes.parse(name)
     assert Probes.parse(probes.describe()) == probes
     states, random = ROWS.astype(np.float64), np.random.default_rng(0)
-    bank, numbers = probes.directions.draw(7, states, random)
+    bank, numbers = probes.directions.around(states)(7, random)
     assert bank.shape[1] == 5
     assert numbers.shape == (7, probes.directions.count(5))
     assert numbers.dtype == np.int32

@@ -9,6 +9,7 @@ from fdtasil.experts.load import load_expert
 from fdtasil.probes.answers import ask_probes
 from fdtasil.probes.scales import measure_scales
 from fdtasil.probes.source import Probes
+from fdtasil.probes.surroundings import Surroundings
 from fdtasil.run.presets import PRESETS
 from fdtasil.seeding import torch_generator
 from fdtasil.student.architectures import Mlp
@@ -31,8 +32,10 @@ def linear_task(states=200, n=6, m=2, spec=None):
     )
     scales = measure_scales(observations)
 
+    around = Surroundings.of(observations, probes, scales)
+
     def ask(sample):
-        return ask_probes(expert, observations, probes, scales, np.random.default_rng(sample))
+        return ask_probes(expert, around, np.random.default_rng(sample))
 
     return demonstrations, probes, ask
 

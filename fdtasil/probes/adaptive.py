@@ -1,12 +1,13 @@
 """Directions that look at the states: isotropic, or half of them where the states lie apart."""
 
 from dataclasses import dataclass
+from functools import partial
 from typing import ClassVar
 
 import numpy as np
 
 from fdtasil.checks import check_count
-from fdtasil.probes.directions import USUAL_COUNT, RandomSphere
+from fdtasil.probes.directions import USUAL_COUNT, Draw, RandomSphere
 
 __all__ = ["AdaptiveDirections", "is_redundant"]
 
@@ -45,18 +46,12 @@ class AdaptiveDirections:
         """All coordinates move."""
         return dimension**0.5
 
-    def draw(
-        self, rows: int, states: np.ndarray, random: np.random.Generator
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """See `Directions.draw`."""
-        bank, numbers = RandomSphere(self.probes).draw(rows, states, random)
-        if is_redundant(states):
-            excursions = _excursions(states, len(bank), random)
-            # At rest nothing moves: what an excursion would waste there stays isotropic.
-            moves = np.linalg.norm(excursions, axis=1) > _SHORT
-            chosen = (random.random(len(bank)) < 0.5) & moves
-            bank = np.where(chosen[:, None], excursions, bank)
-        return bank, numbers
+    def around(self, states: np.ndarray) -> Draw:
+        """See `Directions.around`."""
+        isotropic = RandomSphere(self.probes).around(states)
+        if not is_redundant(states):
+            return isotropic
+        return partial(_mixed, isotropic, _differences(states))
 
 
 def is_redundant(states: np.ndarray) -> bool:
@@ -72,15 +67,26 @@ def is_redundant(states: np.ndarray) -> bool:
     return int((held < _VARIANCE).sum()) + 1 < dimension / 2
 
 
-def _excursions(states: np.ndarray, count: int, random: np.random.Generator) -> np.ndarray:
-    """Return (count, d) random combinations of differences between neighbouring states."""
+def _differences(states: np.ndarray) -> np.ndarray:
+    """Return (S, d) differences between states and the nearest ones of other times."""
     some = np.linspace(0, len(states) - 1, min(len(states), _STATES)).astype(int)
     points = states[some].astype(np.float64)
     squares = (points**2).sum(axis=1)
     distances = squares[:, None] + squares - 2 * points @ points.T
     near_in_time = np.abs(some[:, None] - some) < _APART
     nearest = np.where(near_in_time, np.inf, distances).argmin(axis=1)
-    differences = points - points[nearest]
-    picked = random.integers(len(points), size=(count, _MIXED))
-    factors = random.standard_normal((count, _MIXED)) * (_STRETCH / _MIXED**0.5)
-    return np.einsum("ck,ckd->cd", factors, differences[picked])
+    return points - points[nearest]
+
+
+def _mixed(
+    isotropic: Draw, differences: np.ndarray, rows: int, random: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Draw isotropic directions, and in the place of half of them excursions."""
+    bank, numbers = isotropic(rows, random)
+    picked = random.integers(len(differences), size=(len(bank), _MIXED))
+    factors = random.standard_normal((len(bank), _MIXED)) * (_STRETCH / _MIXED**0.5)
+    excursions = np.einsum("ck,ckd->cd", factors, differences[picked])
+    # At rest nothing moves: what an excursion would waste there stays isotropic.
+    moves = np.linalg.norm(excursions, axis=1) > _SHORT
+    chosen = (random.random(len(bank)) < 0.5) & moves
+    return np.where(chosen[:, None], excursions, bank), numbers

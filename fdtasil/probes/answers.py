@@ -11,19 +11,15 @@ import numpy as np
 from fdtasil.errors import ExpertError, SettingError, warn
 from fdtasil.experts.expert import Expert, Purpose
 from fdtasil.probes.derivatives import differentiate
-from fdtasil.probes.scales import Scales
-from fdtasil.probes.source import Probes
+from fdtasil.probes.surroundings import Drawn, Surroundings
 
 __all__ = ["FROM_THE_START", "Answers", "Beginning", "ask_moved", "ask_probes"]
 
-# States that a design is shown: enough to tell which displacements can occur.
-_SHOWN = 4096
 # Points asked at once: as quick as more for an onnxruntime session, and of an expert that takes
 # 50 ms a row no more than a minute is lost.
 _ROWS = 2**10
 _MUCH = 2**30  # bytes of answers that are announced before they are asked
 _NEEDED = "they need"
-_ROUNDED = 0.1  # share of a step that rounding may take before it is warned of
 
 
 @dataclass(frozen=True)
@@ -80,9 +76,7 @@ FROM_THE_START = Beginning()
 
 def ask_probes(
     expert: Expert,
-    observations: np.ndarray,
-    probes: Probes,
-    scales: Scales,
+    around: Surroundings,
     random: np.random.Generator,
     order: int = 1,
     beginning: Beginning = FROM_THE_START,
@@ -91,20 +85,27 @@ def ask_probes(
 
     Args:
         expert: Who is asked; differentiated instead, if the stencil is exact.
-        observations: (N, n) float32 states.
-        probes: The derivative source, with radius and space set.
-        scales: Of the demonstrations.
+        around: Where.
         random: Draws the directions.
         order: 1, or 2 for exact second derivatives too; a finite stencil has them in its values.
         beginning: What is there already; not used where derivatives are exact.
 
     Raises:
         ExpertError: If the stencil is exact and the expert can't be differentiated.
-        SettingError: If no coordinate moves, a step is lost in rounding or beyond float32, or
-            the answers do not fit into memory.
+        SettingError: If a step is lost in rounding, or the answers do not fit into memory.
     """
+    probes, observations = around.probes, around.observations
+    assert probes.stencil is not None, "the order sets the stencil"
     try:
-        return _ask_probes(expert, observations, probes, scales, random, order, beginning)
+        _check_room(expert, around)
+        drawn = around.sample(random)
+        if probes.exact:
+            along = drawn.displacements, drawn.numbers
+            values = differentiate(expert, observations, *along, order)
+        else:
+            offsets = probes.stencil.offsets
+            values = _ask_values(expert, observations, drawn, offsets, beginning)
+        return Answers(drawn.displacements, drawn.numbers, values, drawn.gains)
     except MemoryError as error:
         numbers = str(error).startswith(_NEEDED) and f": {error}"
         raise SettingError(
@@ -132,54 +133,15 @@ def ask_moved(expert: Expert, points: np.ndarray, purpose: Purpose) -> np.ndarra
         ) from error
 
 
-def _ask_probes(
-    expert: Expert,
-    observations: np.ndarray,
-    probes: Probes,
-    scales: Scales,
-    random: np.random.Generator,
-    order: int,
-    beginning: Beginning,
-) -> Answers:
-    deviation = 1.0 if probes.space == "raw" else scales.deviation
-    step_scale = np.where(scales.probed(probes.space), deviation, 0.0)
-    live = np.flatnonzero(step_scale)
-    assert probes.stencil is not None, "the order sets the stencil"
-    near, far = (1.0, 1.0) if probes.exact else probes.reaches
-    reach = 1.0 if probes.space == "raw" or probes.exact else probes.directions.reach(len(live))
-    # Of one distance: states lie apart in its units. Of many: in units of one deviation.
-    step = reach * (near if near == far else 1.0)
-    shown = np.linspace(0, len(observations) - 1, min(len(observations), _SHOWN)).astype(int)
-    states = observations[shown][:, live] / (step * step_scale[live])
-    count = probes.directions.count(len(live))
-    _check_room(expert, probes, len(observations), observations.shape[1], count)
-    bank, numbers = probes.directions.draw(len(observations), states, random)
-    steps = np.full((len(bank), 1), step)
-    if near != far:
-        steps *= np.exp(random.uniform(np.log(near), np.log(far), steps.shape))
-    displacements = np.zeros((len(bank), len(step_scale)), np.float32)
-    with np.errstate(over="ignore"):  # looked at in the next line
-        displacements[:, live] = steps * bank * step_scale[live]
-    _check_steps(displacements, observations, probes)
-    gains = len(live) ** 0.5 / steps[:, 0]
-    if probes.stencil.exact:
-        values = differentiate(expert, observations, displacements, numbers, order)
-    else:
-        offsets = probes.stencil.offsets
-        values = _ask_values(expert, observations, displacements, numbers, offsets, beginning)
-    return Answers(displacements, numbers, values, gains)
-
-
 def _ask_values(
     expert: Expert,
     observations: np.ndarray,
-    displacements: np.ndarray,
-    numbers: np.ndarray,
+    drawn: Drawn,
     offsets: Sequence[float],
     beginning: Beginning,
 ) -> np.ndarray:
     """Ask for the values at the stencil's points, a bounded number of rows at a time."""
-    states, count = numbers.shape
+    states, count = drawn.numbers.shape
     block = max(1, _ROWS // (count * len(offsets)))
     shifts = np.asarray(offsets, np.float32)[:, None]
     values, done = None, 0
@@ -190,9 +152,9 @@ def _ask_values(
         beginning.told(values[:done], done)
     for start in range(done, states, block):
         rows = slice(start, start + block)
-        moved = displacements[numbers[rows]][:, :, None, :] * shifts
+        moved = drawn.displacements[drawn.numbers[rows]][:, :, None, :] * shifts
         points = observations[rows, None, None, :] + moved
-        _check_moved(points, observations[rows], displacements)
+        _check_moved(points, observations[rows], drawn.displacements)
         answers = ask_moved(expert, points.reshape(-1, points.shape[-1]), "probe")
         if values is None:  # the first block says how long an action is
             values = np.empty((states, count, len(offsets), answers.shape[1]), np.float32)
@@ -203,7 +165,7 @@ def _ask_values(
     return values
 
 
-def _check_room(expert: Expert, probes: Probes, states: int, size: int, count: int) -> None:
+def _check_room(expert: Expert, around: Surroundings) -> None:
     """Refuse what would take more than half of the machine's memory, before anybody is asked.
 
     The system hands out memory that it does not have, and kills who uses it.
@@ -211,7 +173,8 @@ def _check_room(expert: Expert, probes: Probes, states: int, size: int, count: i
     Raises:
         MemoryError: With the numbers.
     """
-    points = 1 if probes.stencil is None else max(1, len(probes.stencil.offsets))
+    (states, size), count, stencil = around.observations.shape, around.count, around.probes.stencil
+    points = 1 if stencil is None else max(1, len(stencil.offsets))
     answers = 4 * states * count * (points * (expert.action_size or 1) + 1)
     # Of one state: its directions, drawn, of length one and scaled, and the points they lead to.
     at_once = count * size * (3 * 8 + 2 * 4 * points)
@@ -239,31 +202,6 @@ def _announce(values: np.ndarray) -> None:
         warn(
             f"the expert's answers, {values.shape[0]:,} states x {values.shape[1]} probes, take "
             f"{values.nbytes / 2**30:.1f} GiB of memory; fewer probes take less and teach alike"
-        )
-
-
-def _check_steps(displacements: np.ndarray, observations: np.ndarray, probes: Probes) -> None:
-    """Refuse steps that float32 can't hold beside the states, and warn of those that it rounds."""
-    squares = displacements.astype(np.float64) ** 2
-    sizes = np.sqrt(squares.sum(axis=0) / np.maximum(np.count_nonzero(squares, axis=0), 1))
-    wide = np.abs(displacements).max() + np.abs(observations).max()
-    if not np.isfinite(wide) or not sizes.any():
-        raise SettingError(
-            f"radius={probes.radius} moves a state by {sizes.max():g}",
-            "steps that float32 can add to the observations",
-            "leave radius= out, or write for example radius=0.3",
-        )
-    if probes.exact:
-        return
-    values = np.sqrt((observations.astype(np.float64) ** 2).mean(axis=0)).astype(np.float32)
-    errors = np.spacing(values) / 12**0.5  # root mean square, of rounding to the nearest
-    shares = np.where(sizes > 0, errors / np.where(sizes > 0, sizes, 1), 0)
-    worst = int(shares.argmax())
-    if shares[worst] > _ROUNDED:
-        warn(
-            f"float32 rounds away {min(1.0, shares[worst]):.0%} of the step along coordinate "
-            f"{worst}, of {sizes[worst]:.2g} beside values of {values[worst]:.2g}: raise the "
-            "radius, or probe in whitened space"
         )
 
 

@@ -1,6 +1,8 @@
 """Where to probe: every design lowers to a bank of directions and row numbers per state."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import ClassVar, Protocol
 
 import numpy as np
@@ -10,6 +12,7 @@ from fdtasil.checks import check_count
 __all__ = [
     "USUAL_COUNT",
     "Directions",
+    "Draw",
     "Jacobian",
     "OrthogonalFrames",
     "RandomSphere",
@@ -22,6 +25,11 @@ USUAL_COUNT = 10
 # Rows of a bank: with more states than this, states share directions, which costs no accuracy
 # (the states differ) and keeps Humanoid's 100,000 states from storing gigabytes of directions.
 _BANK = 4096
+
+
+Draw = Callable[[int, np.random.Generator], tuple[np.ndarray, np.ndarray]]
+"""Number of states to probe, and what draws -> a bank of directions, and which of them each state
+is probed along: (P, d), in units of a step, and (rows, count) row numbers in it."""
 
 
 class Directions(Protocol):
@@ -43,18 +51,11 @@ class Directions(Protocol):
         """Return the length of a step that moves the coordinates it moves by one unit each."""
         ...
 
-    def draw(
-        self, rows: int, states: np.ndarray, random: np.random.Generator
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return a bank of directions, and which of them each state is probed along.
+    def around(self, states: np.ndarray) -> Draw:
+        """Return how directions around states are drawn; what that takes is computed once.
 
         Args:
-            rows: Number of states to probe.
             states: (S, d) demonstrated states, in units of a step; most designs only look at d.
-            random: Draws the directions.
-
-        Returns:
-            The bank (P, d), in units of a step, and (rows, count) row numbers in it.
         """
         ...
 
@@ -74,11 +75,14 @@ class StandardBasis:
         """One coordinate moves."""
         return 1.0
 
-    def draw(
-        self, rows: int, states: np.ndarray, random: np.random.Generator
+    def around(self, states: np.ndarray) -> Draw:
+        """See `Directions.around`."""
+        return partial(self._draw, states.shape[1])
+
+    def _draw(
+        self, dimension: int, rows: int, random: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray]:
-        """See `Directions.draw`; nothing is random."""
-        dimension = states.shape[1]
+        """Nothing is random."""
         numbers = np.broadcast_to(np.arange(dimension, dtype=np.int32), (rows, dimension))
         return np.eye(dimension), numbers
 
@@ -102,11 +106,13 @@ class RandomSphere:
         """All coordinates move."""
         return dimension**0.5
 
-    def draw(
-        self, rows: int, states: np.ndarray, random: np.random.Generator
+    def around(self, states: np.ndarray) -> Draw:
+        """See `Directions.around`."""
+        return partial(self._draw, states.shape[1])
+
+    def _draw(
+        self, dimension: int, rows: int, random: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray]:
-        """See `Directions.draw`."""
-        dimension = states.shape[1]
         size = min(rows * self.probes, max(_BANK, self.probes))
         normal = random.standard_normal((size, dimension))
         bank = normal / np.linalg.norm(normal, axis=1, keepdims=True)
@@ -144,11 +150,13 @@ class OrthogonalFrames:
         """All coordinates move."""
         return dimension**0.5
 
-    def draw(
-        self, rows: int, states: np.ndarray, random: np.random.Generator
+    def around(self, states: np.ndarray) -> Draw:
+        """See `Directions.around`."""
+        return partial(self._draw, states.shape[1])
+
+    def _draw(
+        self, dimension: int, rows: int, random: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray]:
-        """See `Directions.draw`."""
-        dimension = states.shape[1]
         count = self.count(dimension)
         frames_each = -(-count // dimension)
         frames = min(rows * frames_each, max(_BANK // dimension, frames_each))
@@ -179,11 +187,9 @@ class Jacobian:
         """All coordinates move."""
         return dimension**0.5
 
-    def draw(
-        self, rows: int, states: np.ndarray, random: np.random.Generator
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """See `Directions.draw`."""
-        return OrthogonalFrames(None).draw(rows, states, random)
+    def around(self, states: np.ndarray) -> Draw:
+        """See `Directions.around`."""
+        return OrthogonalFrames(None).around(states)
 
 
 def _runs(starts: np.ndarray, length: int, size: int) -> np.ndarray:

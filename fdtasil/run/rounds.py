@@ -156,9 +156,9 @@ class Rounds:
     def _answers(self, round_: int, observations: np.ndarray, lesson: Lesson) -> Answers:
         """Ask the probes around a round's states; the answers are kept on the way."""
         known = self.checkpoints.take_up(round_, ASKED)
-        self.checkpoints.asking.calibrate(
-            lesson.dataset.demonstrations.observations, lesson.scales
-        )
+        asking = self.checkpoints.asking
+        asking.calibrate(lesson.dataset.demonstrations.observations, lesson.scales)
+        around = asking.around(observations, lesson.scales)
         with self.training.progress.bar("probes", "state", len(observations)) as bar:
 
             def told(values: np.ndarray, states: int) -> None:
@@ -167,6 +167,4 @@ class Rounds:
                     self.checkpoints.keep(round_, ASKED, lambda: values, len(values))
 
             beginning = Beginning(known, told)
-            return self.checkpoints.asking.ask(
-                observations, lesson.scales, round_, 0, beginning=beginning
-            )
+            return asking.ask(around, round_, 0, beginning=beginning)

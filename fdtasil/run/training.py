@@ -10,12 +10,12 @@ from fdtasil.errors import warn
 from fdtasil.probes.answers import Answers
 from fdtasil.probes.scales import measure_scales
 from fdtasil.progress import Bar, Progress
-from fdtasil.run.asking import Samples
 from fdtasil.run.checkpoints import TRAINING, Checkpoints, Halfway, Trained
 from fdtasil.run.configuration import Configuration
 from fdtasil.run.events import Callback, Event
 from fdtasil.run.interrupts import Interrupts
 from fdtasil.run.lesson import Lesson
+from fdtasil.run.samples import Samples
 from fdtasil.seeding import torch_generator
 from fdtasil.student.fit import Hooks, fit
 from fdtasil.student.fit_state import FitState
@@ -81,11 +81,8 @@ class Training:
         stored = lesson.dataset.answers
         if self.checkpoints.asking.source is None or stored is None:
             return None
-        observations = lesson.dataset.demonstrations.observations
         asked_before = kept.sample if kept else -1
-        return Samples(
-            self.checkpoints.asking, stored, observations, lesson.scales, round_, asked_before
-        )
+        return Samples(self.checkpoints.asking, stored, lesson, round_, asked_before)
 
     def _fresh(self, seen: Demonstrations, lesson: Lesson, round_: int) -> Student:
         scales, bounds = measure_scales(seen.observations), lesson.dataset

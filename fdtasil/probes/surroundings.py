@@ -1,0 +1,127 @@
+"""Where a source probes around demonstrated states, and how far."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fdtasil.errors import SettingError, warn
+from fdtasil.probes.directions import Draw
+from fdtasil.probes.scales import Scales
+from fdtasil.probes.source import Probes, radius_text
+
+__all__ = ["Drawn", "Surroundings"]
+
+# States that a design is shown: enough to tell which displacements can occur.
+_SHOWN = 4096
+_ROUNDED = 0.1  # share of a step that rounding may take before it is warned of
+
+
+@dataclass(frozen=True)
+class Drawn:
+    """Where a sample probes.
+
+    Attributes:
+        displacements: (P, n) float32 bank of displacements in raw observation units.
+        numbers: (N, k) int32, the rows of the bank that each state is probed along.
+        gains: (P,) see `Answers`.
+    """
+
+    displacements: np.ndarray
+    numbers: np.ndarray
+    gains: np.ndarray
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """What all samples of a source around some states have in common.
+
+    Attributes:
+        observations: (N, n) float32 states.
+        probes: The derivative source, with radius, space and stencil set.
+        live: (d,) the coordinates that are moved.
+        units: (d,) what a direction's components are multiplied by.
+        step: Length of a direction's step in deviations, over all coordinates.
+        ends: The nearest and the farthest that it is stretched to.
+        draw: Draws directions in these coordinates.
+    """
+
+    observations: np.ndarray
+    probes: Probes
+    live: np.ndarray
+    units: np.ndarray
+    step: float
+    ends: tuple[float, float]
+    draw: Draw
+
+    @classmethod
+    def of(cls, observations: np.ndarray, probes: Probes, scales: Scales) -> "Surroundings":
+        """Return the surroundings of (N, n) states.
+
+        Args:
+            observations: The states.
+            probes: The derivative source, with radius, space and stencil set.
+            scales: Of the demonstrations.
+
+        Raises:
+            SettingError: If no coordinate moves, or a step is lost in rounding or beyond float32.
+        """
+        live = np.flatnonzero(scales.probed(probes.space))
+        raw, usual = probes.space == "raw", probes.directions.reach(len(live))
+        deviation = np.ones(len(live)) if raw else scales.deviation[live]
+        ends = (1.0, 1.0) if probes.exact else probes.reaches
+        step = 1.0 if raw or probes.exact else usual
+        _check_steps(step / usual * ends[0] * deviation, observations[:, live], probes, live)
+        _check_ends(step * ends[1] * deviation, observations[:, live], probes)
+        # Of one distance: states lie apart in its units. Of many: in units of one deviation.
+        if ends[0] == ends[1]:
+            step, ends = step * ends[0], (1.0, 1.0)
+        units = step * deviation
+        shown = np.linspace(0, len(observations) - 1, min(len(observations), _SHOWN)).astype(int)
+        draw = probes.directions.around(observations[shown][:, live] / units)
+        return cls(observations, probes, live, units, step, ends, draw)
+
+    @property
+    def count(self) -> int:
+        """k, how many directions each state is probed along."""
+        return self.probes.directions.count(len(self.live))
+
+    def sample(self, random: np.random.Generator) -> Drawn:
+        """Draw directions, and how far each of them leads."""
+        bank, numbers = self.draw(len(self.observations), random)
+        stretch = np.ones((len(bank), 1))
+        if self.ends[0] != self.ends[1]:
+            near, far = np.log(self.ends)
+            stretch = np.exp(random.uniform(near, far, stretch.shape))
+        displacements = np.zeros((len(bank), self.observations.shape[1]), np.float32)
+        displacements[:, self.live] = stretch * bank * self.units
+        gains = len(self.live) ** 0.5 / (self.step * stretch[:, 0])
+        return Drawn(displacements, numbers, gains)
+
+
+def _check_ends(sizes: np.ndarray, values: np.ndarray, probes: Probes) -> None:
+    """Refuse steps that float32 can't hold beside the states."""
+    with np.errstate(over="ignore"):  # looked at in the next line
+        widest = np.float32(sizes.max()) + np.abs(values).max()
+    if not np.isfinite(widest) or not np.float32(sizes).any():
+        assert probes.radius is not None, "the preset sets the radius"
+        raise SettingError(
+            f"radius={radius_text(probes.radius)} moves a state by up to {sizes.max():g}",
+            "steps that float32 can add to the observations",
+            "leave radius= out, or write for example radius=0.3",
+        )
+
+
+def _check_steps(sizes: np.ndarray, values: np.ndarray, probes: Probes, live: np.ndarray) -> None:
+    """Warn of steps that rounding changes."""
+    if probes.exact:
+        return
+    lengths = np.sqrt((values.astype(np.float64) ** 2).mean(axis=0)).astype(np.float32)
+    errors = np.spacing(lengths) / 12**0.5  # root mean square, of rounding to the nearest
+    shares = np.divide(errors, sizes, out=np.full(len(sizes), np.inf), where=sizes > 0)
+    worst = int(shares.argmax())
+    if shares[worst] > _ROUNDED:
+        warn(
+            f"float32 rounds away {min(1.0, shares[worst]):.0%} of the step along coordinate "
+            f"{live[worst]}, of {sizes[worst]:.2g} beside values of {lengths[worst]:.2g}: raise "
+            "the radius, or probe in whitened space"
+        )

@@ -1,0 +1,60 @@
+"""The expert's answers in a round's training: those stored, then those asked anew."""
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from fdtasil.probes.answers import Answers
+from fdtasil.probes.surroundings import Surroundings
+from fdtasil.run.asking import Asking
+from fdtasil.run.lesson import Lesson
+
+__all__ = ["Samples"]
+
+
+@dataclass
+class Samples:
+    """The expert's answers, a sample of all states at a time.
+
+    Attributes:
+        asking: Asks for new ones.
+        stored: The answers of sample 0.
+        lesson: What is learnt, and its scales.
+        round: The round.
+        asked_before: Number of the sample that the interrupted run had asked for last, or -1.
+        number: Of the sample in use.
+    """
+
+    asking: Asking
+    stored: Answers
+    lesson: Lesson
+    round: int
+    asked_before: int = -1
+    number: int = 0
+
+    @cached_property
+    def around(self) -> Surroundings:
+        """Where the source probes; the same for all samples."""
+        return self.asking.around(self.observations, self.lesson.scales)
+
+    @property
+    def observations(self) -> np.ndarray:
+        """(N, n) the states."""
+        return self.lesson.dataset.demonstrations.observations
+
+    @property
+    def offsets(self) -> tuple[float, ...]:
+        """Of the stencil; none where derivatives are exact."""
+        source = self.asking.source
+        return source.stencil.offsets if source and source.stencil else ()
+
+    def __call__(self, number: int) -> Answers:
+        """Return the answers of a sample; what was stored is not asked again."""
+        answers = self.stored if number == 0 else self._ask(number)
+        self.number = number
+        return answers
+
+    def _ask(self, number: int) -> Answers:
+        ask = self.asking.ask_again if number == self.asked_before else self.asking.ask
+        return ask(self.around, self.round, number)
