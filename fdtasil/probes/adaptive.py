@@ -75,7 +75,7 @@ def _differences(states: np.ndarray) -> np.ndarray:
     distances = squares[:, None] + squares - 2 * points @ points.T
     near_in_time = np.abs(some[:, None] - some) < _APART
     nearest = np.where(near_in_time, np.inf, distances).argmin(axis=1)
-    return points - points[nearest]
+    return (points - points[nearest]).astype(np.float32)
 
 
 def _mixed(
@@ -84,9 +84,12 @@ def _mixed(
     """Draw isotropic directions, and in the place of half of them excursions."""
     bank, numbers = isotropic(rows, random)
     picked = random.integers(len(differences), size=(len(bank), _MIXED))
-    factors = random.standard_normal((len(bank), _MIXED)) * (_STRETCH / _MIXED**0.5)
-    excursions = np.einsum("ck,ckd->cd", factors, differences[picked])
+    factors = random.standard_normal((len(bank), _MIXED), np.float32) * (_STRETCH / _MIXED**0.5)
+    excursions = np.zeros_like(bank)
+    for factor, row in zip(factors.T, picked.T, strict=True):
+        excursions += factor[:, None] * differences[row]
     # At rest nothing moves: what an excursion would waste there stays isotropic.
     moves = np.linalg.norm(excursions, axis=1) > _SHORT
     chosen = (random.random(len(bank)) < 0.5) & moves
-    return np.where(chosen[:, None], excursions, bank), numbers
+    bank[chosen] = excursions[chosen]
+    return bank, numbers

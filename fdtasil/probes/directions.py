@@ -114,8 +114,8 @@ class RandomSphere:
         self, dimension: int, rows: int, random: np.random.Generator
     ) -> tuple[np.ndarray, np.ndarray]:
         size = min(rows * self.probes, max(_BANK, self.probes))
-        normal = random.standard_normal((size, dimension))
-        bank = normal / np.linalg.norm(normal, axis=1, keepdims=True)
+        bank = random.standard_normal((size, dimension), np.float32)
+        bank /= np.linalg.norm(bank, axis=1, keepdims=True)
         # Neighbours in the bank are independent, so a run of them is a fresh sample for a state.
         starts = np.arange(rows) * self.probes
         if size < rows * self.probes:

@@ -88,12 +88,15 @@ class Surroundings:
     def sample(self, random: np.random.Generator) -> Drawn:
         """Draw directions, and how far each of them leads."""
         bank, numbers = self.draw(len(self.observations), random)
+        bank = bank.astype(np.float32, copy=False)
         stretch = np.ones((len(bank), 1))
         if self.ends[0] != self.ends[1]:
             near, far = np.log(self.ends)
             stretch = np.exp(random.uniform(near, far, stretch.shape))
         displacements = np.zeros((len(bank), self.observations.shape[1]), np.float32)
-        displacements[:, self.live] = stretch * bank * self.units
+        displacements[:, self.live] = (
+            stretch.astype(np.float32) * bank * self.units.astype(np.float32)
+        )
         gains = len(self.live) ** 0.5 / (self.step * stretch[:, 0])
         return Drawn(displacements, numbers, gains)
 
