@@ -30,7 +30,7 @@ from fdtasil.version import __version__
 if TYPE_CHECKING:
     from fdtasil.demonstrations.dataset import Dataset
     from fdtasil.demonstrations.minari_data import from_minari, to_minari
-    from fdtasil.demonstrations.trainers import DAgger, Dart
+    from fdtasil.demonstrations.trainers import DAgger, Dart, NoisyExpert
     from fdtasil.errors import FdtasilError, FdtasilWarning
     from fdtasil.experts.expert import Expert
     from fdtasil.experts.load import load_expert
@@ -56,6 +56,7 @@ __all__ = [
     "Fit",
     "Log",
     "Mlp",
+    "NoisyExpert",
     "Probes",
     "Student",
     "__version__",
@@ -70,7 +71,7 @@ __all__ = [
 _ROOMS = {
     "demonstrations.dataset": ("Dataset",),
     "demonstrations.minari_data": ("from_minari", "to_minari"),
-    "demonstrations.trainers": ("DAgger", "Dart"),
+    "demonstrations.trainers": ("DAgger", "Dart", "NoisyExpert"),
     "errors": ("FdtasilError", "FdtasilWarning"),
     "experts.expert": ("Expert",),
     "experts.load": ("load_expert",),

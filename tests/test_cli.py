@@ -131,7 +131,7 @@ def test_inspect_distill_evaluate(expert, inside, tmp_path):
     for promised in ("expert", "plain cloning", "student", "queries: "):
         assert promised in done.stdout
     report = json.loads((tmp_path / "run" / "report.json").read_text())
-    assert report["queries"]["probe"] == 400
+    assert report["queries"]["probe"] == 1600  # 40 states, 40 steps, ten visits a sample
     judged = inside("evaluate", tmp_path / "run" / "student.onnx", TOY, "--expert", expert)
     assert judged.returncode == 0, judged.stderr
     assert "normalised return" in judged.stdout

@@ -5,12 +5,20 @@ import pytest
 from conftest import GAIN, QUICK, TOY
 
 import fdtasil
-from fdtasil.demonstrations.trainers import TRAINERS, DAgger, Dart, Situation, trainer_of
+from fdtasil.demonstrations.trainers import (
+    TRAINERS,
+    DAgger,
+    Dart,
+    NoisyExpert,
+    Situation,
+    trainer_of,
+)
 from fdtasil.errors import SettingError
 from fdtasil.experts.load import load_expert
 from fdtasil.rollouts.environments import EnvironmentPool
 from fdtasil.rollouts.rollout import rollout
 
+HALF = np.array([1.0, 2.0], np.float32)
 ROWS = np.random.default_rng(0).uniform(-0.5, 0.5, (400, 5)).astype(np.float32)
 
 
@@ -30,7 +38,7 @@ def decide(trainer, round_, student, rows=ROWS):
             noise = [np.random.default_rng(e) for e in range(count)]
             return rollout(behaviour, pool, range(count), 20, noise)
 
-        behaviour = trainer.behaviour(Situation(round_, expert, student, record))
+        behaviour = trainer.behaviour(Situation(round_, expert, HALF, student, record))
         asked = dict(expert.queries)
         decision = behaviour(rows, [np.random.default_rng(e) for e in range(len(rows))])
     return decision, asked
@@ -57,8 +65,27 @@ def test_the_papers_rounds():
 @pytest.mark.parametrize("name", TRAINERS)
 def test_the_expert_acts_in_round_0(name):
     decision, _ = decide(trainer_of(name), 0, None)
-    assert np.array_equal(decision.action, linear(ROWS))
-    assert np.array_equal(decision.expert_action, decision.action)
+    assert np.array_equal(decision.expert_action, linear(ROWS))
+    noisy = (decision.action != linear(ROWS)).any(axis=1)
+    assert noisy.tolist() == [name == "noise" and row % 2 == 0 for row in range(len(ROWS))]
+
+
+def test_noise_is_a_share_of_half_the_range():
+    decision, _ = decide(NoisyExpert(sigma=0.25), 0, None)
+    deviations = (decision.action - linear(ROWS))[::2].std(axis=0)
+    assert deviations == pytest.approx(0.25 * HALF, rel=0.15)
+    still, _ = decide(NoisyExpert(sigma=0), 0, None)
+    assert np.array_equal(still.action, linear(ROWS))
+
+
+def test_each_second_episode_is_noisy_however_many_run_side_by_side():
+    """Twenty-five at a time are stepped together; labels are the expert's own everywhere."""
+    run = {**QUICK, "probes": 0, "trainer": "noise", "episodes": 60, "horizon": 3}
+    states = fdtasil.distill(linear, TOY, **run).demonstrations
+    off = (states.taken != states.actions).any(axis=1)
+    assert [bool(off[states.episode == e].all()) for e in range(60)] == [True, False] * 30
+    assert [bool(off[states.episode == e].any()) for e in range(60)] == [True, False] * 30
+    assert np.allclose(states.actions, linear(states.observations), atol=1e-6)
 
 
 def test_dagger_blends():
@@ -122,7 +149,7 @@ def test_noise_of_a_single_state_is_finite(alpha):
         def record(behaviour, count):
             return rollout(behaviour, pool, [0], 1)
 
-        situation = Situation(1, expert, off_by(np.array([0.3, -0.1])), record)
+        situation = Situation(1, expert, HALF, off_by(np.array([0.3, -0.1])), record)
         act = Dart(alpha=alpha, extra=1).behaviour(situation)
         noise = [np.random.default_rng(e) for e in range(len(ROWS))]
         apart = act(ROWS, noise).action - linear(ROWS)

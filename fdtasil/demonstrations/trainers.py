@@ -18,6 +18,7 @@ __all__ = [
     "BehaviourCloning",
     "DAgger",
     "Dart",
+    "NoisyExpert",
     "Situation",
     "Trainer",
     "describe_trainer",
@@ -35,6 +36,7 @@ class Situation:
     Attributes:
         round: i.
         expert: Answers, and counts its rows under "act".
+        half_range: (m,) half the range of each action; 1 where it has none.
         student: The last round's policy; None in round 0.
         record: Behaviour and number of episodes -> that many extra episodes of the round, which
             are not labelled; their expert rows count.
@@ -42,6 +44,7 @@ class Situation:
 
     round: int
     expert: Expert
+    half_range: np.ndarray
     student: Policy | None
     record: Callable[[Behaviour, int], Episodes]
 
@@ -204,6 +207,44 @@ class Dart:
         return (vectors * np.sqrt(np.maximum(values, 0))) @ vectors.T
 
 
+@dataclass(frozen=True)
+class NoisyExpert:
+    """The expert acts, in half of the episodes with Gaussian noise (arXiv 2507.09061, section 4).
+
+    Attributes:
+        sigma: Standard deviation of the noise, as a share of half the range of each action.
+    """
+
+    sigma: float = 0.1
+    name: str = field(default="noise", init=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "sigma", check_number("sigma", self.sigma, example=0.1))
+
+    def rounds(self, episodes: int) -> list[int]:
+        """One round of all episodes."""
+        return [episodes]
+
+    def behaviour(self, situation: Situation) -> Behaviour:
+        """The expert, noisy in the first episode and every second one after it; labels are not."""
+        expert, spread = situation.expert, self.sigma * situation.half_range
+        numbers: dict[np.random.Generator, int] = {}  # of episodes, by their own generator
+
+        def act(observations: np.ndarray, noise: Sequence[np.random.Generator]) -> Decision:
+            answers = expert.ask(observations, "act")
+            actions = answers.copy()
+            for row, random in enumerate(noise):
+                if numbers.setdefault(random, len(numbers)) % 2 == 0:
+                    actions[row] += spread * random.standard_normal(len(spread))
+            return Decision(actions, answers)
+
+        return act
+
+    def queries(self, episodes: int, horizon: int) -> dict[str, int]:
+        """One row for each step."""
+        return {"act": episodes * horizon, "label": 0}
+
+
 def _expert_acts(expert: Expert) -> Behaviour:
     def act(observations: np.ndarray, noise: Sequence[np.random.Generator]) -> Decision:
         answers = expert.ask(observations, "act")
@@ -248,6 +289,7 @@ TRAINERS: dict[str, Callable[[], Trainer]] = {
     "bc": BehaviourCloning,
     "dagger": DAgger,
     "dart": Dart,
+    "noise": NoisyExpert,
 }
 
 

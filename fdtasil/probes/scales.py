@@ -1,5 +1,6 @@
 """How far each coordinate of the observations moves: what is divided by, what is probed."""
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -26,6 +27,8 @@ class Scales:
         deviation: (n,) standard deviation of the states.
         live: (n,) bool, whether the coordinate moves; others are not probed in whitened space.
         seen: (n,) bool, whether the student sees the coordinate; others are never probed.
+        told: (n,) bool, whether somebody said how far the coordinate will go; it is moved alone
+            too.
     """
 
     mean: np.ndarray
@@ -33,6 +36,18 @@ class Scales:
     deviation: np.ndarray
     live: np.ndarray
     seen: np.ndarray
+    told: np.ndarray
+
+    def spread_by(self, deviations: Mapping[int, float]) -> "Scales":
+        """Return the scales with coordinates that are said to vary by other deviations."""
+        if not deviations:
+            return self
+        columns, values = list(deviations), list(deviations.values())
+        deviation, scale = self.deviation.copy(), self.scale.copy()
+        live, told = self.live.copy(), self.told.copy()
+        deviation[columns] = scale[columns] = values
+        live[columns] = told[columns] = True
+        return Scales(self.mean, scale, deviation, live, self.seen, told)
 
     def probed(self, space: str | None) -> np.ndarray:
         """Return (n,) bool, the coordinates that are probed in a space.
@@ -65,4 +80,5 @@ def measure_scales(observations: np.ndarray, seen: np.ndarray | None = None) -> 
     median = float(np.median(deviation[moving]))
     live = moving & (deviation > _STILL * median)
     scale = np.where(live, np.maximum(deviation, _FLOOR * median), 1.0)
-    return Scales(mean, scale, deviation, live, np.ones_like(live) if seen is None else seen)
+    visible = np.ones_like(live) if seen is None else seen
+    return Scales(mean, scale, deviation, live, visible, np.zeros_like(live))

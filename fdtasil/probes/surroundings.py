@@ -13,6 +13,7 @@ __all__ = ["Drawn", "Surroundings"]
 
 # States that a design is shown: enough to tell which displacements can occur.
 _SHOWN = 4096
+_APART = 0.25  # share of the directions that move what was told of alone, and as many the others
 _ROUNDED = 0.1  # share of a step that rounding may take before it is warned of
 
 
@@ -39,6 +40,7 @@ class Surroundings:
         observations: (N, n) float32 states.
         probes: The derivative source, with radius, space and stencil set.
         live: (d,) the coordinates that are moved.
+        told: (d,) bool, those of them that somebody said how far will go.
         units: (d,) what a direction's components are multiplied by.
         step: Length of a direction's step in deviations, over all coordinates.
         ends: The nearest and the farthest that it is stretched to.
@@ -48,6 +50,7 @@ class Surroundings:
     observations: np.ndarray
     probes: Probes
     live: np.ndarray
+    told: np.ndarray
     units: np.ndarray
     step: float
     ends: tuple[float, float]
@@ -78,7 +81,7 @@ class Surroundings:
         units = step * deviation
         shown = np.linspace(0, len(observations) - 1, min(len(observations), _SHOWN)).astype(int)
         draw = probes.directions.around(observations[shown][:, live] / units)
-        return cls(observations, probes, live, units, step, ends, draw)
+        return cls(observations, probes, live, scales.told[live], units, step, ends, draw)
 
     @property
     def count(self) -> int:
@@ -88,17 +91,28 @@ class Surroundings:
     def sample(self, random: np.random.Generator) -> Drawn:
         """Draw directions, and how far each of them leads."""
         bank, numbers = self.draw(len(self.observations), random)
-        bank = bank.astype(np.float32, copy=False)
+        bank = bank.astype(np.float32)
         stretch = np.ones((len(bank), 1))
         if self.ends[0] != self.ends[1]:
             near, far = np.log(self.ends)
             stretch = np.exp(random.uniform(near, far, stretch.shape))
+        if self.told.any() and not self.probes.exact and self.probes.directions.reach(2) > 1:
+            self._take_apart(bank, random)
         displacements = np.zeros((len(bank), self.observations.shape[1]), np.float32)
         displacements[:, self.live] = (
             stretch.astype(np.float32) * bank * self.units.astype(np.float32)
         )
         gains = len(self.live) ** 0.5 / (self.step * stretch[:, 0])
         return Drawn(displacements, numbers, gains)
+
+    def _take_apart(self, bank: np.ndarray, random: np.random.Generator) -> None:
+        """Let a quarter of (P, d) directions move only what was told of, and a quarter not."""
+        lot, normal = random.random(len(bank)), random.standard_normal(bank.shape, np.float32)
+        alone, rest = lot < _APART, (lot >= _APART) & (lot < 2 * _APART)
+        # Drawn anew: directions between demonstrated states leave still what is still in them.
+        bank[alone] = np.where(self.told, normal[alone] / bank.shape[1] ** 0.5, 0)
+        if not self.told.all():
+            bank[rest] *= ~self.told
 
 
 def _check_ends(sizes: np.ndarray, values: np.ndarray, probes: Probes) -> None:

@@ -28,11 +28,15 @@ class Boxes:
         low: (m,) float32, lower action bounds in environment units; -inf where there is none.
             Bounds that float32 does not have are rounded inwards.
         high: (m,) float32, upper action bounds.
+        observation_low: (n,) float64, lower bounds of the observations; -inf where there is none.
+        observation_high: (n,) float64, upper ones. None where nobody asks for them.
     """
 
     observation_size: int
     low: np.ndarray
     high: np.ndarray
+    observation_low: np.ndarray | None = None
+    observation_high: np.ndarray | None = None
 
     @property
     def action_size(self) -> int:
@@ -252,7 +256,9 @@ def _read_boxes(environment: gymnasium.Env, name: str) -> tuple[Boxes, OwnBounds
             "lower bounds below upper bounds",
             "drop the fixed actions with a gymnasium.ActionWrapper",
         )
-    return Boxes(int(observation.shape[0]), low, high), own
+    n, wide = int(observation.shape[0]), np.float64
+    seen = _unbounded(observation.low.astype(wide)), _unbounded(observation.high.astype(wide))
+    return Boxes(n, low, high, *seen), own
 
 
 def _unbounded(bound: np.ndarray) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 from dataclasses import dataclass, replace
 
-from fdtasil.checks import check_count, spelt
+from fdtasil.checks import check_choice, check_count, spelt
 from fdtasil.demonstrations.dataset import Dataset
 from fdtasil.demonstrations.trainers import BehaviourCloning, Trainer, trainer_of
 from fdtasil.errors import SettingError
@@ -10,8 +10,10 @@ from fdtasil.experts.cost import CHEAP, multiply_adds
 from fdtasil.files.storage import sha256
 from fdtasil.probes.directions import USUAL_COUNT
 from fdtasil.probes.source import FRESH, Probes
+from fdtasil.probes.spread import Spread, SpreadLike
 from fdtasil.probes.stencils import FORWARD
 from fdtasil.rollouts.environments import resolve_horizon
+from fdtasil.rollouts.survivors import KEEPS
 from fdtasil.rollouts.trials import fingerprint
 from fdtasil.run.configuration import Configuration
 from fdtasil.run.presets import Preset, preset_of
@@ -42,6 +44,8 @@ class Arguments:
         seed: The one seed.
         student: The architecture of its network.
         student_obs: What it sees.
+        keep: Which demonstrations are kept.
+        spread: How far coordinates will go that hardly move in the demonstrations.
         fit: The optimisation.
         evaluation_episodes: Paired episodes, where there is something to compare.
         max_queries: The most that the expert may be asked, or None.
@@ -58,6 +62,8 @@ class Arguments:
     seed: int
     student: Architecture
     student_obs: StudentObservation | None
+    keep: str
+    spread: SpreadLike | None
     fit: Fit
     evaluation_episodes: int
     max_queries: int | None
@@ -70,31 +76,25 @@ class Arguments:
             SettingError: If the environment allows no such horizon.
             EnvironmentFault: If it fails in its first steps.
         """
-        usual = self._with_source(subject, self.probes)
+        usual = self._usual(subject)
         if self.anew is None:
             return usual
-        work = (
-            None
-            if subject.expert is None
-            else multiply_adds(subject.expert, usual.observation_size)
-        )
+        work, n = None, usual.observation_size
+        if subject.expert is not None:
+            work = multiply_adds(subject.expert, n)
         if work is None:
-            return replace(usual, reason="nobody can say what a query costs")
-        about = f"a query is {work:,} multiply-adds"
+            return replace(usual, reason="asked once: what a query costs is not known")
         if work > CHEAP:
-            return replace(usual, reason=f"{about}, more than {CHEAP:,}")
-        fresh = self._with_source(subject, self.anew)
-        due = sum(fresh.predicted_queries().values())
+            return replace(usual, reason=f"asked once: {work:,} multiply-adds a query")
+        anew = replace(usual, probes=self.anew, calibrated=True, probes_given=False)
+        due = sum(anew.predicted_queries().values())
         if self.max_queries is not None and due > self.max_queries:
-            reason = (
-                f"asking anew takes {due:,} queries, more than max_queries={self.max_queries:,}"
-            )
-            return replace(usual, reason=reason)
-        return replace(fresh, reason=f"{about}, at most {CHEAP:,}")
+            return replace(usual, reason=f"asked once: {due:,} queries are more than max_queries")
+        return replace(anew, reason=f"asked anew all the time: {work:,} multiply-adds a query")
 
-    def _with_source(self, subject: Subject, source: Probes | None) -> Configuration:
-        given, expert = self.given, subject.expert
-        stored = given is not None and given.answers is not None and source is self.probes
+    def _usual(self, subject: Subject) -> Configuration:
+        given, source, expert = self.given, self.probes, subject.expert
+        stored = given is not None and given.answers is not None
         calibrates = source is not None and self.preset.calibrates(source)
         horizon = resolve_horizon(self.horizon, subject.pool) if subject.pool else 0
         (start,) = episode_seeds(self.seed, "evaluation", 0, 1)
@@ -120,9 +120,16 @@ class Arguments:
             evaluation_episodes=self.evaluation_episodes if subject.comparable else 0,
             max_queries=self.max_queries,
             batch=expert.chunk if expert else 0,
+            keep=self.keep,
+            spread=self._spread(subject),
             fingerprint=fingerprint(subject.pool, start) if subject.pool else None,
             reason=None,
         )
+
+    def _spread(self, subject: Subject) -> Spread:
+        boxes = subject.pool.boxes if subject.pool else None
+        low, high = (boxes.observation_low, boxes.observation_high) if boxes else (None, None)
+        return Spread.of(self.spread, low, high, subject.observation_size)
 
 
 def read_arguments(
@@ -135,6 +142,8 @@ def read_arguments(
     seed: int,
     student: Architecture,
     student_obs: StudentObservation | None,
+    keep: str,
+    spread: SpreadLike | None,
     fit: Fit | None,
     preset: str,
     evaluation_episodes: int,
@@ -159,11 +168,22 @@ def read_arguments(
         seed=check_count("seed", seed, 0, 2**32 - 1),
         student=check_architecture(student),
         student_obs=student_obs,
+        keep=_checked_keep(keep, given),
+        spread=spread,
         fit=fit,
         evaluation_episodes=check_count("evaluation_episodes", evaluation_episodes, least=0),
         max_queries=None if max_queries is None else check_count("max_queries", max_queries, 0),
         device=_checked_device(device),
     )
+
+
+def _checked_keep(keep: str, given: Dataset | None) -> str:
+    check_choice("keep", keep, KEEPS)
+    if keep != KEEPS[0] and given is not None:
+        raise SettingError(
+            f"keep={keep!r} with a given dataset", "nothing to record", "leave keep= out"
+        )
+    return keep
 
 
 def _checked_device(device: object) -> str:

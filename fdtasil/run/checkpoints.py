@@ -59,7 +59,7 @@ class Collected:
     Attributes:
         dataset: Labelled states, and the answers around them.
         episodes: How many were recorded so far.
-        counts: Clipped actions, physics resets and falls in them.
+        counts: Clipped actions, physics resets, falls and replaced episodes in them.
     """
 
     dataset: Dataset

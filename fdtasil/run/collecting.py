@@ -2,6 +2,7 @@
 
 from collections import Counter
 from dataclasses import dataclass
+from functools import partial
 
 import numpy as np
 
@@ -15,6 +16,7 @@ from fdtasil.rollouts.behaviours import Behaviour, Policy
 from fdtasil.rollouts.environments import EnvironmentPool
 from fdtasil.rollouts.episodes import Episodes, check_episodes
 from fdtasil.rollouts.rollout import rollout
+from fdtasil.rollouts.survivors import SURVIVORS, survivors
 from fdtasil.run.checkpoints import Collected
 from fdtasil.seeding import episode_seeds, generator
 
@@ -35,6 +37,7 @@ class Collecting:
         horizon: T, steps after which an episode is cut.
         seed: Of starts and noise.
         progress: Progress bars.
+        keep: Which of the expert's own episodes are kept.
     """
 
     trainer: Trainer
@@ -43,6 +46,7 @@ class Collecting:
     horizon: int
     seed: int
     progress: Progress
+    keep: str
 
     def record(
         self, round_: int, count: int, before: Collected | None, student: Policy | None
@@ -63,11 +67,16 @@ class Collecting:
         episodes = self._episodes(behaviour, "rollout", first, count)
         if round_ == 0:  # every trainer's expert acts alone there
             check_episodes(episodes, self.pool.name)
+        replaced = 0
+        if round_ == 0 and self.keep == SURVIVORS:
+            further = partial(self._episodes, behaviour, "survivors")
+            episodes, replaced = survivors(episodes, further, self.pool.name)
         states = label(episodes, self.expert, first, round_)
         boxes, counts = self.pool.boxes, Counter(before.counts if before else {})
         counts["clipped_actions"] += episodes.clipped_actions
         counts["physics_resets"] += int(episodes.physics_resets.sum())
         counts["terminated_episodes"] += int(episodes.terminated.sum())
+        counts["replaced_episodes"] += replaced
         dataset = Dataset(states, None, None, boxes.low, boxes.high, self.pool.name)
         return Collected(dataset, first + len(episodes.valid), counts)
 
@@ -104,7 +113,11 @@ class Collecting:
         def record_extra(behaviour: Behaviour, extra: int) -> Episodes:
             return self._episodes(behaviour, f"extra {round_}", 0, extra)
 
-        return self.trainer.behaviour(Situation(round_, self.expert, student, record_extra))
+        boxes = self.pool.boxes
+        bounded = np.isfinite(boxes.low) & np.isfinite(boxes.high)
+        half = np.where(bounded, (boxes.high - boxes.low) / 2, np.float32(1))
+        situation = Situation(round_, self.expert, half, student, record_extra)
+        return self.trainer.behaviour(situation)
 
     def _episodes(self, behaviour: Behaviour, stream: str, first: int, count: int) -> Episodes:
         numbers = range(first, first + count)

@@ -11,6 +11,8 @@ from fdtasil.experts.expert import rows_text
 from fdtasil.experts.gate import GATE_QUERIES, GATE_STATES, large_batch
 from fdtasil.probes.calibration import Ladder, ladder_for
 from fdtasil.probes.source import Probes
+from fdtasil.probes.spread import Spread
+from fdtasil.rollouts.survivors import ATTEMPTS, SURVIVORS
 from fdtasil.student.architectures import Architecture, describe
 from fdtasil.student.fit import Fit
 
@@ -43,9 +45,11 @@ class Configuration:
         evaluation_episodes: Paired episodes of the evaluation; 0 where nothing is compared.
         max_queries: The most that the expert may be asked, or None.
         batch: Rows that the expert is asked at once, at most.
+        keep: Which demonstrations are kept, "all" or "survivors".
+        spread: How far coordinates will go that hardly move in the demonstrations.
         fingerprint: Of the environment; see `rollouts/trials.py`. None where there is none, or it
             does not repeat itself.
-        reason: Why the source is asked anew, or is not, where no caller says which it is.
+        reason: How often probes are asked and why, where no caller says which they are.
     """
 
     expert: str | None
@@ -69,6 +73,8 @@ class Configuration:
     evaluation_episodes: int
     max_queries: int | None
     batch: int
+    keep: str
+    spread: Spread
     fingerprint: dict[str, Any] | None
     reason: str | None
 
@@ -83,6 +89,8 @@ class Configuration:
         found: dict[str, int] = dict.fromkeys(purposes, 0)
         if self.trainer is not None:
             found |= self.trainer.queries(self.episodes, self.horizon)
+            if self.keep == SURVIVORS:
+                found["act"] += ATTEMPTS * self.rounds[0] * self.horizon
         if self.probes is not None and not self.probes_given:
             found["probe"] = self._predicted_probes(self.probes)
             found["calibrate"] = self.ladder.queries if self.calibrated else 0
@@ -141,6 +149,7 @@ class Configuration:
             "trainer": describe_trainer(self.trainer) if self.trainer else "none",
             "probes": self.probes.describe() if self.probes else "none",
             "student": describe(self.student),
+            "spread": self.spread.to_json(),
             "fit": self.fit.to_json(anew=self.probes is not None and self.probes.resample),
         }
         whole = {name: written.get(name, value) for name, value in vars(self).items()}

@@ -2,8 +2,11 @@
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from fdtasil.demonstrations.dataset import Dataset
 from fdtasil.probes.scales import Scales, measure_scales
+from fdtasil.probes.spread import Spread
 from fdtasil.run.checkpoints import Collected
 from fdtasil.student.view import StudentObservation, View
 
@@ -30,8 +33,15 @@ class Lesson:
         collected: Collected,
         student_obs: StudentObservation | None,
         before: "Lesson | None",
+        spread: Spread,
     ) -> "Lesson":
-        """Return the lesson of what is collected; its view is that of the rounds before.
+        """Return the lesson of what is collected.
+
+        Args:
+            collected: What is learnt from.
+            student_obs: What the student sees.
+            before: That of the round before, whose view it has; None in the first round.
+            spread: How far coordinates will go that hardly move.
 
         Raises:
             SettingError: If the student can't see so.
@@ -39,7 +49,22 @@ class Lesson:
         states = collected.dataset.demonstrations
         first = states.observations[states.round == 0][:256]
         view = View.of(student_obs, first) if before is None else before.view
-        return cls(collected, view, measure_scales(states.observations, view.seen))
+        scales = measure_scales(states.observations, view.seen)
+        told = spread.among(states.observations, states.episode)
+        return cls(collected, view, scales.spread_by(told))
+
+    def normaliser(self, seen: np.ndarray) -> Scales:
+        """Return the scales of (N, k) observations as the student sees them."""
+        own, columns = measure_scales(seen), self.view.columns
+        told = np.flatnonzero(self.scales.told).tolist()
+        if columns is None and self.view.size != len(self.scales.told):
+            return own  # of a function of the observation: its values alone tell
+        mine = {
+            columns.index(i) if columns else i: float(self.scales.deviation[i])
+            for i in told
+            if columns is None or i in columns
+        }
+        return own.spread_by(mine)
 
     @property
     def dataset(self) -> Dataset:

@@ -15,6 +15,7 @@ from fdtasil.experts.expert import Expert, Hints
 from fdtasil.experts.gate import GATE_STATES, compare_again, large_batch
 from fdtasil.experts.load import ExpertLike, load_expert, open_expert, sized
 from fdtasil.probes.source import Probes
+from fdtasil.probes.spread import SpreadLike
 from fdtasil.progress import Progress
 from fdtasil.results.distilled import Distilled, write_run
 from fdtasil.results.evaluation import Evaluation, evaluate_pair
@@ -53,6 +54,8 @@ def distill(
     seed: int = 0,
     student: Architecture = Mlp(),
     student_obs: StudentObservation | None = None,
+    keep: str = "all",
+    spread: SpreadLike | None = None,
     fit: Fit | None = None,
     preset: str = "standard",
     dataset: DatasetLike | None = None,
@@ -88,13 +91,19 @@ def distill(
             nothing is differenced), radius=R, raw, whitened, per_step=K. Radius and stencil that
             are left open are found by asking at a ladder of radii first.
         trainer: Who acts in which round: "bc" (the expert), "dagger" (a mixture of expert and
-            student), "dart" (the expert with noise), or a trainer with settings of its own.
+            student), "dart" (the expert with noise as large as the student's errors), "noise" (the
+            expert with noise in every second episode), or a trainer with settings of its own.
         episodes: Number of demonstrations. Left out, 20, or those of `dataset`.
         horizon: Steps after which an episode is cut; default: the environment's time limit.
         seed: Equal seeds give equal bytes, on one machine with the same versions.
         student: The architecture of its network, `fdtasil.Mlp(hidden, activation)`.
         student_obs: Indices of the coordinates that the student sees, or a function
             (B, n) -> (B, k); the expert sees all. Probes move only what the student sees.
+        keep: Which of the expert's own episodes are learnt from: "all", or "survivors", which
+            records others (three at most) in the place of each that the environment ended.
+        spread: How far coordinates will go on the machine that stand still in the demonstrations,
+            such as a command, a goal or a mass: {coordinate: deviation}, or "bounds" for those
+            that have finite ones. They are probed that far, alone and together with the others.
         fit: Length, optimiser, order and weights of the loss, validation: `fdtasil.Fit(...)`.
             Left out, the preset's.
         preset: Where defaults of probes and fit come from: "standard", or "paper" (TaSIL's
@@ -147,6 +156,8 @@ def distill(
         seed=seed,
         student=student,
         student_obs=student_obs,
+        keep=keep,
+        spread=spread,
         fit=fit,
         preset=preset,
         evaluation_episodes=evaluation_episodes,
@@ -245,7 +256,7 @@ def _collecting(run: Configuration, subject: Subject, bars: Progress) -> Collect
     expert, pool = subject.expert, subject.pool
     if run.trainer is None or expert is None or pool is None:
         return None
-    return Collecting(run.trainer, expert, pool, run.horizon, run.seed, bars)
+    return Collecting(run.trainer, expert, pool, run.horizon, run.seed, bars, run.keep)
 
 
 def _complete(
@@ -261,7 +272,7 @@ def _complete(
     with torch_settings(device) as precision:
         theirs = _examined(rounds, subject, force=force)
         checkpoints.account.start_clock()
-        lesson, trained = rounds.complete(given)
+        lesson, trained = rounds.complete(given, theirs)
         seconds, student, evaluation = checkpoints.account.seconds, trained.student, None
         if subject.expert is not None and subject.pool is not None and theirs is not None:
             policy, last = lesson.view.policy(student.act), trained.history[-1]

@@ -55,7 +55,7 @@ def report_of(
     before = run.predicted_queries()
     chosen = {purpose: before[purpose] for purpose in ("calibrate", "check")}
     predicted = replace(run, probes=source).predicted_queries() | chosen
-    counts = ("clipped_actions", "physics_resets", "terminated_episodes")
+    counts = ("clipped_actions", "physics_resets", "terminated_episodes", "replaced_episodes")
     return {
         "expert": {
             "path": run.expert,
@@ -64,6 +64,7 @@ def report_of(
         },
         **{name: plain[name] for name in ("env", "trainer", "seed")},
         "probes": source.describe() if source else "none",
+        "probes_chosen": run.reason,
         "radius": source.radius if source else None,
         "calibration": calibration.to_json() if calibration else None,
         "versions": versions(),

@@ -9,6 +9,7 @@ import numpy as np
 from fdtasil.demonstrations.dataset import Dataset
 from fdtasil.probes.answers import Answers, Beginning
 from fdtasil.rollouts.behaviours import Policy
+from fdtasil.rollouts.episodes import Episodes
 from fdtasil.run.checkpoints import (
     ASKED,
     COLLECTED,
@@ -21,6 +22,7 @@ from fdtasil.run.checkpoints import (
 )
 from fdtasil.run.collecting import Collecting
 from fdtasil.run.configuration import Configuration
+from fdtasil.run.doubts import warn_of_falls, warn_of_still_coordinates
 from fdtasil.run.events import Event
 from fdtasil.run.lesson import Lesson
 from fdtasil.run.training import Training
@@ -50,11 +52,12 @@ class Rounds:
         """Where every stage is kept."""
         return self.training.checkpoints
 
-    def complete(self, given: Dataset | None) -> tuple[Lesson, Trained]:
+    def complete(self, given: Dataset | None, expert: Episodes | None) -> tuple[Lesson, Trained]:
         """Do every round, beginning where the folder's checkpoints end.
 
         Args:
             given: The dataset, where nothing is recorded.
+            expert: The expert's own episodes, where there are some.
 
         Returns:
             What the last round learnt from, and what it came to.
@@ -65,6 +68,10 @@ class Rounds:
             policy = lesson.view.policy(trained.student.act) if lesson and trained else None
             lesson = self._learnt_from(round_, count, collected, lesson, policy)
             collected = lesson.collected
+            if round_ == 0 and expert is not None:
+                warn_of_falls(collected.dataset.demonstrations, expert, self.run.keep)
+            if round_ == len(self.run.rounds) - 1 and expert is not None:
+                warn_of_still_coordinates(lesson, expert)
             trained = self._trained(round_, lesson, trained)
             last = trained.history[-1]
             self.training.callback(Event("round", round_, trained.steps, last, trained.student))
@@ -101,7 +108,7 @@ class Rounds:
             return made[0].collected
 
         collected = self._once(round_, COLLECTED, collect)
-        return made[0] if made else Lesson.of(collected, self.student_obs, lesson)
+        return made[0] if made else Lesson.of(collected, self.student_obs, lesson, self.run.spread)
 
     def _recorded(
         self,
@@ -144,7 +151,7 @@ class Rounds:
             joined = before.dataset.demonstrations + states
             whole = replace(new, dataset=replace(before.dataset, demonstrations=joined))
             old = before.dataset.answers
-        around = Lesson.of(whole, self.student_obs, lesson)
+        around = Lesson.of(whole, self.student_obs, lesson, self.run.spread)
         if self.run.probes is None:
             return around
         answers = self._answers(round_, states.observations, around)

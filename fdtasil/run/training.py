@@ -8,7 +8,6 @@ import torch
 from fdtasil.demonstrations.states import Demonstrations
 from fdtasil.errors import warn
 from fdtasil.probes.answers import Answers
-from fdtasil.probes.scales import measure_scales
 from fdtasil.progress import Bar, Progress
 from fdtasil.run.checkpoints import TRAINING, Checkpoints, Halfway, Trained
 from fdtasil.run.configuration import Configuration
@@ -85,7 +84,7 @@ class Training:
         return Samples(self.checkpoints.asking, stored, lesson, round_, asked_before)
 
     def _fresh(self, seen: Demonstrations, lesson: Lesson, round_: int) -> Student:
-        scales, bounds = measure_scales(seen.observations), lesson.dataset
+        scales, bounds = lesson.normaliser(seen.observations), lesson.dataset
         start = torch_generator(self.run.seed, "student", round_)
         return Student(self.run.student, scales.mean, scales.scale, bounds.low, bounds.high, start)
 

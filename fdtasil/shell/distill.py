@@ -63,7 +63,8 @@ def _distill(baseline: bool, **arguments: Any) -> None:
         else:
             result = distil({**arguments, **place})  # it stays in its own folder
         print(_side_by_side(result, cloning()))
-    print(f"queries: {rows_text(result.queries)}")
+    chosen = result.report["probes_chosen"]
+    print(f"queries: {rows_text(result.queries)}" + (f" ({chosen})" if chosen else ""))
     print(f"saved in {out}: student.onnx, student.safetensors, report.json, figures/, ...")
 
 

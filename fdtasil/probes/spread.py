@@ -1,0 +1,101 @@
+"""Coordinates that stand still in the demonstrations, and will not on the machine."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, Literal
+
+import numpy as np
+
+from fdtasil.checks import check_count, check_number, spelt
+from fdtasil.errors import SettingError
+
+__all__ = ["Spread", "SpreadLike", "stands_still"]
+
+SpreadLike = Mapping[int, float] | Literal["bounds"]
+"""Coordinate -> the deviation that it is probed by; or those of uniform values in their bounds."""
+
+_STILL = 1e-3  # of what a coordinate varies between episodes, that it may vary within one
+_EXPECTED = 'a deviation for each coordinate, or "bounds"'
+_EXAMPLE = "write for example spread={3: 0.5}"
+
+
+@dataclass(frozen=True)
+class Spread:
+    """How far coordinates will go that hardly move in the demonstrations.
+
+    Attributes:
+        deviations: By coordinate, in units of the observations.
+        where_still: Whether it holds only for coordinates that are constant within episodes.
+    """
+
+    deviations: Mapping[int, float]
+    where_still: bool = False
+
+    @classmethod
+    def of(
+        cls, given: SpreadLike | None, low: np.ndarray | None, high: np.ndarray | None, n: int
+    ) -> "Spread":
+        """Read the argument `spread`.
+
+        Args:
+            given: Deviations by coordinate; "bounds", or None for none.
+            low: (n,) bounds of the observations, or None where there is no environment.
+            high: (n,) upper bounds.
+            n: Length of an observation.
+
+        Raises:
+            SettingError: If it can't be used.
+        """
+        if given is None:
+            return cls({})
+        if isinstance(given, Mapping):
+            read = {
+                check_count("a coordinate of spread", key, 0, n - 1): check_number(
+                    f"spread of coordinate {key}", value, positive=True
+                )
+                for key, value in given.items()
+            }
+            return cls(dict(sorted(read.items())))
+        if not isinstance(given, str) or given != "bounds":
+            raise SettingError(spelt("spread", given), _EXPECTED, _EXAMPLE)
+        if (
+            low is None
+            or high is None
+            or not (bounded := np.isfinite(low) & np.isfinite(high)).any()
+        ):
+            raise SettingError(
+                "spread='bounds' of observations without bounds", "finite ones", _EXAMPLE
+            )
+        # Of values that are uniform between the bounds.
+        deviations = {int(i): float(high[i] - low[i]) / 12**0.5 for i in np.flatnonzero(bounded)}
+        return cls(deviations, where_still=True)
+
+    def among(self, observations: np.ndarray, episode: np.ndarray) -> dict[int, float]:
+        """Return the deviations that hold for (N, n) states of (N,) episodes."""
+        if not self.where_still:
+            return dict(self.deviations)
+        within = _widest_within(observations, episode)
+        return {i: d for i, d in self.deviations.items() if within[i] <= _STILL * d}
+
+    def to_json(self) -> dict[str, Any] | None:
+        """Return the deviations by coordinate as plain JSON values, or None without any."""
+        return {str(i): d for i, d in self.deviations.items()} or None
+
+
+def stands_still(observations: np.ndarray, episode: np.ndarray) -> np.ndarray:
+    """Return (n,) bool, the coordinates that are constant within episodes and differ between them.
+
+    Args:
+        observations: (N, n) states.
+        episode: (N,) their episodes.
+    """
+    numbers = np.unique(episode)
+    means = np.stack([observations[episode == e].mean(axis=0, dtype=np.float64) for e in numbers])
+    between = means.std(axis=0)
+    return (between > 0) & (_widest_within(observations, episode) <= _STILL * between)
+
+
+def _widest_within(observations: np.ndarray, episode: np.ndarray) -> np.ndarray:
+    """Return (n,) the largest range of each coordinate within an episode."""
+    ranges = [np.ptp(observations[episode == e], axis=0) for e in np.unique(episode)]
+    return np.max(ranges, axis=0)

@@ -1,0 +1,60 @@
+"""What demonstrations lack, said before a student is trained on them."""
+
+import numpy as np
+
+from fdtasil.demonstrations.states import Demonstrations
+from fdtasil.errors import warn
+from fdtasil.probes.spread import stands_still
+from fdtasil.rollouts.episodes import Episodes
+from fdtasil.rollouts.survivors import SURVIVORS
+from fdtasil.run.lesson import Lesson
+
+__all__ = ["warn_of_falls", "warn_of_still_coordinates"]
+
+_FEW = 5  # demonstrations, of which each counts
+_USUALLY = 0.75  # share of the expert's episodes that it survives
+_SHOWN = 8  # coordinates named in a warning
+
+
+def warn_of_falls(states: Demonstrations, expert: Episodes, keep: str) -> None:
+    """Warn of a demonstration that ended early, where the expert usually lasts.
+
+    Args:
+        states: Of the expert's demonstrations.
+        expert: (E, T) its own episodes, from other starts.
+        keep: Which demonstrations are kept.
+    """
+    lasts, horizon = 1 - float(expert.terminated.mean()), expert.valid.shape[1]
+    episodes, lengths = np.unique(states.episode, return_counts=True)
+    fallen = lengths[np.isin(episodes, states.episode[states.terminated])]
+    if len(fallen) and len(episodes) <= _FEW and lasts >= _USUALLY and keep != SURVIVORS:
+        warn(
+            f"{len(fallen)} of {len(episodes)} demonstrations ended early, after "
+            f"{', '.join(map(str, fallen))} of {horizon} steps, and the expert lasts in "
+            f'{lasts:.0%} of its episodes: keep="survivors" records others in their place'
+        )
+
+
+def warn_of_still_coordinates(lesson: Lesson, expert: Episodes) -> None:
+    """Warn of coordinates of which few demonstrations show few values.
+
+    Args:
+        lesson: What is learnt from.
+        expert: (E, T) the expert's own episodes, from other starts.
+    """
+    states, scales = lesson.dataset.demonstrations, lesson.scales
+    count = len(np.unique(states.episode))
+    number = np.broadcast_to(np.arange(len(expert.valid))[:, None], expert.valid.shape)
+    seen = expert.observations[expert.valid]
+    still = stands_still(seen, number[expert.valid]) & scales.seen & ~scales.told
+    found = np.flatnonzero(still)
+    if not len(found) or count > 2 * _FEW:
+        return
+    deviations = seen.std(axis=0, dtype=np.float64)
+    told = ", ".join(f"{i}: {deviations[i]:.2g}" for i in found[:_SHOWN])
+    more = f" and {len(found) - _SHOWN} more" if len(found) > _SHOWN else ""
+    warn(
+        f"{len(found)} coordinates stand still within an episode and differ between episodes, "
+        f"such as a command, a goal or a mass; {count} demonstrations show {count} values of "
+        f"them: spread={{{told}}}{more} probes them as far as the expert's own episodes differ"
+    )
