@@ -13,8 +13,9 @@ TRAINERS = {
     "dagger": DAgger(updates=(1, 2)),
     "dagger, switch, student alone": DAgger(updates=(1, 2), beta=0.0, mix="switch"),
     "dart": Dart(updates=(1, 2), extra=2),
+    "noise": "noise",
 }
-SOURCES = ["none", "basis", "sphere:3", "sphere:2,resample", "orthogonal:3"]
+SOURCES = ["none", "basis", "sphere:3", "sphere:2,resample", "orthogonal:3", "fresh:2"]
 CELLS = [
     (trainer, source if source == "none" else f"{source},{stencil}")
     for trainer in TRAINERS

@@ -1,5 +1,8 @@
 """Stored answers train other students without a question; students may see less."""
 
+import io
+import json
+
 import numpy as np
 import pytest
 from conftest import QUICK, TOY, mlp_onnx
@@ -49,11 +52,23 @@ def test_only_the_evaluation_asks(run, linear):
     assert result.evaluation.episodes == 2
 
 
+def test_demonstrations_of_version_1_are_read(linear):
+    """They have one gain for all displacements."""
+    given = fdtasil.distill(linear, TOY, 3, **QUICK).dataset
+    arrays = dict(np.load(io.BytesIO(given.to_bytes())))
+    about = json.loads(arrays["about"].tobytes()) | {"version": 1}
+    arrays["about"] = np.frombuffer(json.dumps(about).encode(), np.uint8)
+    arrays["gain"] = arrays.pop("gains")[0]
+    target = io.BytesIO()
+    np.savez(target, **arrays)
+    assert Dataset.from_bytes(target.getvalue()).to_bytes() == given.to_bytes()
+
+
 def test_stored_probes_can_be_left_or_added(run, linear, tmp_path):
     plain = fdtasil.distill(dataset=run, probes=0, **SMALL)
     assert plain.history[0]["derivative_error"] == 0
     bare = plain.save(tmp_path / "bare")
-    with pytest.raises(SettingError, match="without an expert to ask"):
+    with pytest.raises(SettingError, match="without an expert"):
         fdtasil.distill(dataset=Dataset.from_bytes(_without_answers(run)), **SMALL)
     added = fdtasil.distill(linear, dataset=Dataset.from_bytes(_without_answers(run)), **SMALL)
     assert added.queries["probe"] == 10 * len(added.demonstrations)

@@ -19,7 +19,7 @@ def test_the_code_runs(tmp_path, monkeypatch):
     """All blocks in turn, as one session, in an empty folder beside the experts."""
     (tmp_path / "experts").symlink_to(ROOT / "experts")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(Fit, "total_steps", lambda fit, states: 50)  # for the same files
+    monkeypatch.setattr(Fit, "total_steps", lambda fit, states, **_: 50)  # for the same files
     session = {}
     for block in BLOCKS:
         exec(compile(block, "README.md", "exec"), session)

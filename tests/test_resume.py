@@ -133,7 +133,7 @@ def test_a_broken_checkpoint_is_named_and_an_earlier_one_used(expert, golden, tm
     assert read(folder) == expected
 
 
-@pytest.mark.parametrize("probes", ["sphere:2,forward", "sphere:12,forward,resample"])
+@pytest.mark.parametrize("probes", ["sphere:2,forward", "sphere:12,forward,resample", "fresh:12"])
 def test_a_run_that_asked_all_it_may_is_resumed(probes, expert, tmp_path):
     """What was asked again is no part of the budget, and the budget may be another."""
     run = {**RUN, "trainer": "bc", "probes": probes}

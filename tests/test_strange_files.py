@@ -875,7 +875,7 @@ def test_arrays_of_other_types_become_ours_or_are_refused(quick):
         "episode": plain["episode"] + 0.5,
         "round": plain["round"].astype(np.int64) + 2**40,
         "terminated": plain["terminated"] + 3,
-        "gain": np.array(-1.0),
+        "gains": -plain["gains"],
         "observations": plain["observations"].astype(complex),
         "about": np.frombuffer(DEEP, np.uint8),
     }.items():

@@ -1,6 +1,6 @@
 """What a query of an expert costs, as its kind and size say, and never as a clock does."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -113,13 +113,13 @@ class _Operations(TorchDispatchMode):
 
     def __torch_dispatch__(
         self,
-        func: Callable[..., Any],
+        func: Any,
         types: object,
         args: tuple[Any, ...] = (),
         kwargs: dict[str, Any] | None = None,
     ) -> Any:
         result = func(*args, **(kwargs or {}))
         self.count += 1
-        if isinstance(result, torch.Tensor):
+        if isinstance(result, torch.Tensor) and not func.is_view:
             self.numbers += result.numel()
         return result

@@ -51,6 +51,7 @@ def report_of(
     """
     plain, account = run.to_json(), checkpoints.account
     source, calibration = checkpoints.asking.source, checkpoints.asking.calibration
+    radius = source.radius if source else None
     # The ladder, and the gate's batch, were chosen before it was known what the ladder finds.
     before = run.predicted_queries()
     chosen = {purpose: before[purpose] for purpose in ("calibrate", "check")}
@@ -65,7 +66,7 @@ def report_of(
         **{name: plain[name] for name in ("env", "trainer", "seed")},
         "probes": source.describe() if source else "none",
         "probes_chosen": run.reason,
-        "radius": source.radius if source else None,
+        "radius": list(radius) if isinstance(radius, tuple) else radius,
         "calibration": calibration.to_json() if calibration else None,
         "versions": versions(),
         "evaluation": evaluation.to_json() if evaluation else None,

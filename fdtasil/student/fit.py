@@ -24,17 +24,26 @@ from fdtasil.student.step import gradient_step
 
 __all__ = ["Fit", "Hooks", "fit", "hold_out"]
 
-# Where nobody says a length: so many steps up to so many states, and more for more. Answers that
-# are asked anew are never learnt by heart, and longer training goes on teaching.
-_USUAL, _ANEW = (4_000, 1_500), (12_000, 13_500)
-_NUMBERS = (
-    "learning_rate",
-    "weight_decay",
-    "epsilon",
-    "weight",
-    "curvature_weight",
-    "moved_weight",
-)
+
+@dataclass(frozen=True)
+class _Length:
+    """How long and how fast is trained where nobody says it.
+
+    Attributes:
+        steps: Gradient steps, up to so many states.
+        states: Beyond them more, by the square root of their number.
+        rate: Peak learning rate.
+    """
+
+    steps: int
+    states: int
+    rate: float
+
+
+_USUAL = _Length(4_000, 1_500, 1e-3)
+# Answers that are asked anew are never learnt by heart: longer and faster goes on teaching.
+_ANEW = _Length(12_000, 13_500, 2e-3)
+_NUMBERS = ("weight_decay", "epsilon", "weight", "curvature_weight", "moved_weight")
 _LOG_EVERY = 100  # steps between two entries of the history; reading a loss waits for the device
 
 
@@ -47,7 +56,8 @@ class Fit:
             anew; beyond 1,500 states, or 13,500, more by the square root of their number.
         epochs: Visits of each state in a round, instead of steps.
         batch_size: States in a minibatch at most; an epoch's are of almost equal size.
-        learning_rate: Peak learning rate of AdamW, with cosine decay to zero.
+        learning_rate: Peak learning rate of AdamW, with cosine decay to zero. Left out, 0.001, or
+            0.002 where the expert is asked anew.
         weight_decay: Decoupled weight decay.
         epsilon: AdamW's epsilon.
         order: Of the Taylor loss: 1, or 2 to match second differences too (central stencil, or
@@ -74,7 +84,7 @@ class Fit:
     steps: int | None = None
     epochs: int | None = None
     batch_size: int = 100
-    learning_rate: float = 1e-3
+    learning_rate: float | None = None
     weight_decay: float = 0.01
     epsilon: float = 1e-8
     order: int = 1
@@ -91,8 +101,9 @@ class Fit:
         self._check("order", partial(check_count, most=2))
         for name in _NUMBERS:
             usual = Fit.__dataclass_fields__[name].default
-            positive = name == "learning_rate"
-            self._check(name, partial(check_number, positive=positive, example=usual))
+            self._check(name, partial(check_number, example=usual))
+        rate = partial(check_number, positive=True, example=_USUAL.rate)
+        self._check("learning_rate", rate)
         self._check("max_gradient_norm", partial(check_number, positive=True))
         self._check("validation", partial(check_share, whole=False))
         if self.steps is not None and self.epochs is not None:
@@ -113,10 +124,15 @@ class Fit:
 
     def to_json(self, *, anew: bool = False) -> dict[str, Any]:
         """Return the fields as plain JSON values, and the rule for a length that is left out."""
-        rule: dict[str, Any] = {"steps_for": None}
+        rule: dict[str, Any] = {"steps_for": None, "learning_rate": self.rate(anew=anew)}
         if self.steps is None and self.epochs is None:
-            rule = dict(zip(("steps", "steps_for"), _ANEW if anew else _USUAL, strict=True))
+            usual = _ANEW if anew else _USUAL
+            rule |= {"steps": usual.steps, "steps_for": usual.states}
         return {**asdict(self), **rule}
+
+    def rate(self, *, anew: bool = False) -> float:
+        """Return the peak learning rate."""
+        return self.learning_rate or (_ANEW if anew else _USUAL).rate
 
     def weights(self, match: Match) -> Weights:
         """Return the weights of a loss that holds a student to answers in that way."""
@@ -142,10 +158,10 @@ class Fit:
             return self.epochs * self.steps_an_epoch(states)
         if self.steps is not None:
             return self.steps
-        usual, enough = _ANEW if anew else _USUAL
-        if states <= enough:
-            return usual
-        grown = usual * (states / enough) ** 0.5
+        usual = _ANEW if anew else _USUAL
+        if states <= usual.states:
+            return usual.steps
+        grown = usual.steps * (states / usual.states) ** 0.5
         return _LOG_EVERY * round(grown / _LOG_EVERY)  # a last entry of a few steps tells little
 
     def held_out(self, episodes: int) -> int:
@@ -216,11 +232,11 @@ def fit(
     training, held_out = hold_out(demonstrations, settings, random("held out"))
     per_epoch = settings.steps_an_epoch(len(training))
     anew = probes is not None and probes.resample
-    steps = settings.total_steps(len(training), anew=anew)
+    steps, rate = settings.total_steps(len(training), anew=anew), settings.rate(anew=anew)
     told.begin(steps)
     optimiser = torch.optim.AdamW(
         student.parameters(),
-        lr=settings.learning_rate,
+        lr=rate,
         weight_decay=settings.weight_decay,
         eps=settings.epsilon,
         fused=True,
@@ -248,7 +264,7 @@ def fit(
     for batch in islice(dealt, max(0, steps - state.step)):
         if state.step % per_epoch == 0 and state.step > 0:
             told.checkpoint(state)
-        state.count(step(batch, _cosine(settings.learning_rate, state.step, steps)))
+        state.count(step(batch, _cosine(rate, state.step, steps)))
         if state.step % _LOG_EVERY == 0 or state.step == steps:
             held = _held_out_loss(loss_of, judges)
             told.entry(state.log(held))

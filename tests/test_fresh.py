@@ -1,0 +1,282 @@
+"""Experts that are asked anew at every visit, and who is asked so where nobody says it."""
+
+import dataclasses
+
+import numpy as np
+import pytest
+import torch
+from conftest import GAIN, QUICK, TOY, mlp_onnx
+from toy_environments import Integrator
+
+import fdtasil
+from fdtasil.errors import SettingError
+from fdtasil.experts.cost import CHEAP, multiply_adds
+from fdtasil.probes.calibration import calibrate
+from fdtasil.probes.scales import measure_scales
+from fdtasil.probes.source import Probes
+from fdtasil.student.fit import Fit
+
+pytestmark = pytest.mark.usefixtures("no_pictures")
+
+
+def linear(rows):
+    return rows @ GAIN.T
+
+
+@pytest.fixture(scope="module")
+def expert(tmp_path_factory):
+    return mlp_onnx(tmp_path_factory.mktemp("expert") / "e.onnx", sizes=(5, 16, 16, 2))
+
+
+# --- asking
+
+
+def test_no_query_is_asked_twice_and_all_are_as_predicted():
+    asked = []
+
+    def noting(rows):
+        asked.append(rows.copy())
+        return linear(rows)
+
+    result = fdtasil.distill(noting, TOY, "fresh", **{**QUICK, "fit": Fit(steps=40)})
+    assert result.queries == result.report["predicted_queries"]
+    assert result.queries["probe"] == 4 * 400  # forty states, ten visits a sample
+    rows = np.concatenate(asked)
+    assert len(np.unique(rows[-1600 - 40 : -40], axis=0)) > 1500
+    assert result.report["radius"] == [0.05, 2.0]
+
+
+@pytest.mark.parametrize("trainer", ["dagger", "dart"])
+@pytest.mark.parametrize("order", [1, 2])
+def test_every_trainer_and_order_asks_anew(trainer, order):
+    settings = {**QUICK, "episodes": 3, "fit": Fit(steps=30, order=order), "trainer": trainer}
+    result = fdtasil.distill(linear, TOY, "fresh", student_obs=[0, 1, 2, 3], **settings)
+    assert result.queries == result.report["predicted_queries"]
+    last = result.history[-1]
+    assert last["moved_error"] > 0
+    assert last["derivative_error"] > 0
+    assert (last["curvature_error"] > 0) == (order == 2)
+
+
+def test_an_expert_of_steps_is_not_asked_where_it_says_nothing():
+    random = np.random.default_rng(1)
+    states = np.random.default_rng(0).standard_normal((200, 5)).astype(np.float32)
+    scales, source = measure_scales(states), Probes.parse("fresh,whitened")
+    found = {}
+    for name, answer in {
+        "smooth": linear,
+        "noisy": lambda rows: linear(rows) + 0.05 * random.standard_normal((len(rows), 2)),
+        "steps": lambda rows: np.sign(linear(rows)),
+    }.items():
+        expert = fdtasil.load_expert(answer, 5, 2)
+        ladder = calibrate(expert, states, scales, np.random.default_rng(0), 0.3)
+        found[name] = ladder.complete(source).radius
+    assert found["smooth"] == (0.05, 2.0)
+    assert found["steps"] == (0.5, 2.0)
+    assert 0.05 < found["noisy"][0] <= 1
+    assert found["noisy"][1] == 2.0
+
+
+# --- who is asked anew
+
+
+def test_what_is_cheap_follows_from_kind_and_size(expert, tmp_path):
+    with torch.random.fork_rng():
+        narrow = torch.nn.Linear(5, 2)
+        wide = torch.nn.Sequential(torch.nn.Linear(5, 1024), torch.nn.Linear(1024, 1024))
+
+    class Planner(torch.nn.Module):
+        """Small, and takes thousands of operations."""
+
+        def forward(self, rows):
+            for _ in range(1000):
+                rows = rows + 1
+            return rows[:, :2]
+
+    experts = {
+        "onnx": (expert, 5 * 16 + 16 * 16 + 16 * 2, True),
+        "quantised": (mlp_onnx(tmp_path / "odd.onnx", reshape_to=[-1, 5]), 5 * 8 + 8 * 2, True),
+        "module": (narrow, 10, True),
+        "wide": (wide, 2**20, False),
+        "planner": (Planner(), None, None),
+        "function": (linear, None, None),
+    }
+    for name, (source, least, cheap) in experts.items():
+        found = multiply_adds(fdtasil.load_expert(source, 5), 5)
+        if least is None:
+            assert found is None, name
+            continue
+        assert least <= found <= least + 10_000, name
+        assert (found <= CHEAP) == cheap, name
+    assert multiply_adds(fdtasil.load_expert(expert, 5, workers=2, threads=True), 5) is None
+
+
+@pytest.mark.parametrize(
+    ("change", "anew", "said"),
+    [
+        ({}, True, "asked anew all the time: 403 multiply-adds a query"),
+        ({"max_queries": 2500}, False, "are more than max_queries"),
+        ({"preset": "paper", "fit": Fit(steps=3)}, False, None),
+        ({"probes": 10}, False, None),
+        ({"probes": "fresh"}, True, None),
+    ],
+)
+def test_the_default_says_what_it_takes(change, anew, said, expert):
+    result = fdtasil.distill(expert, TOY, **{**QUICK, **change})
+    assert ("resample" in result.report["probes"]) == anew
+    reason = result.report["probes_chosen"]
+    assert reason is None if said is None else said in reason
+    assert result.report["steps"] == result.settings["fit"]["steps"]
+
+
+def test_the_default_of_a_function_is_asked_once():
+    result = fdtasil.distill(linear, TOY, **QUICK)
+    assert result.report["probes"].startswith("adaptive:10,")
+    assert result.report["probes_chosen"] == "asked once: what a query costs is not known"
+
+
+def test_a_run_that_was_asked_anew_is_learnt_from_again(expert):
+    """With the expert anew; without it from the answers that are stored."""
+    first = fdtasil.distill(expert, TOY, **QUICK)
+    alone = fdtasil.distill(dataset=first.dataset, student=QUICK["student"], fit=QUICK["fit"])
+    assert alone.queries == dict.fromkeys(alone.queries, 0)
+    assert alone.history[-1]["moved_error"] > 0
+    shape = {name: QUICK[name] for name in ("horizon", "student", "fit", "evaluation_episodes")}
+    again = fdtasil.distill(expert, TOY, dataset=first.dataset, **shape)
+    assert again.queries["probe"] == first.queries["probe"]
+
+
+def test_longer_and_faster_where_answers_are_new():
+    assert [Fit().total_steps(n, anew=True) for n in (1, 13_500, 54_000)] == [12e3, 12e3, 24e3]
+    assert (Fit().rate(), Fit().rate(anew=True)) == (1e-3, 2e-3)
+    assert Fit(learning_rate=0.5).rate(anew=True) == 0.5
+
+
+# --- coordinates that stand still
+
+
+class Commanded(Integrator):
+    """The velocities are to be those of a command, one for each episode."""
+
+    def __init__(self):
+        super().__init__(wall=np.inf)
+        self.observation_space = fdtasil_box()
+
+    def reset(self, *, seed=None, options=None):
+        observation, about = super().reset(seed=seed, options=options)
+        self.command = self.np_random.uniform(-1, 1)
+        return np.concatenate([observation[:4], [self.command]]), about
+
+    def step(self, action):
+        observation, _, _, cut, about = super().step(action)
+        reward = 1 - np.abs(self.velocity - self.command).mean()
+        return np.concatenate([observation[:4], [self.command]]), reward, False, cut, about
+
+
+def fdtasil_box():
+    import gymnasium
+
+    ends = np.array([np.inf] * 4 + [1.0])
+    return gymnasium.spaces.Box(-ends, ends, (5,), np.float64)
+
+
+def follows(rows):
+    return np.tanh(3 * (rows[:, 4:] - rows[:, 2:4]))
+
+
+COMMANDED = {
+    "episodes": 1,
+    "horizon": 40,
+    "student": fdtasil.Mlp(32),
+    "fit": Fit(steps=600),
+    "evaluation_episodes": 10,
+}
+
+
+@pytest.mark.parametrize("spread", [{4: 0.58}, "bounds"])
+def test_one_demonstration_teaches_every_command(spread):
+    result = fdtasil.distill(follows, Commanded, "fresh", spread=spread, **COMMANDED)
+    assert result.settings["spread"] == {"4": pytest.approx(0.58, abs=0.01)}
+    assert not result.report["warnings"]
+    assert result.evaluation.normalized_return > 0.9
+
+
+def test_coordinates_that_stand_still_are_named():
+    with pytest.warns(fdtasil.FdtasilWarning, match=r"spread=\{4: 0\.\d+\}"):
+        result = fdtasil.distill(follows, Commanded, "fresh", **COMMANDED)
+    assert result.evaluation.normalized_return < 0.7
+
+
+def test_what_was_told_of_is_moved_alone_too():
+    states = np.random.default_rng(0).standard_normal((400, 5)).astype(np.float32)
+    states[:, 4] = 1
+    scales = measure_scales(states).spread_by({4: 0.5})
+    from fdtasil.probes.surroundings import Surroundings
+
+    source = dataclasses.replace(Probes.parse("sphere:10,radius=1,whitened,forward"))
+    moved = Surroundings.of(states, source, scales).sample(np.random.default_rng(0)).displacements
+    alone = (moved[:, :4] == 0).all(axis=1)
+    rest = moved[:, 4] == 0
+    assert alone.mean() == pytest.approx(0.25, abs=0.03)
+    assert rest.mean() == pytest.approx(0.25, abs=0.03)
+    assert moved[alone, 4].std() == pytest.approx(0.5, rel=0.1)
+
+
+@pytest.mark.parametrize(
+    "spread", ["far", {5: 1.0}, {"command": 1.0}, {0: 0.0}, {0: "a"}, [0.5], 3]
+)
+def test_a_wrong_spread_is_refused(spread):
+    with pytest.raises(SettingError, match="next step"):
+        fdtasil.distill(linear, TOY, "fresh", spread=spread, **QUICK)
+
+
+# --- demonstrations that fell
+
+
+class Falling(Integrator):
+    """Every third start ends after five steps."""
+
+    def reset(self, *, seed=None, options=None):
+        self.count, self.falls = 0, seed is not None and seed % 3 == 0
+        return super().reset(seed=seed, options=options)
+
+    def step(self, action):
+        observation, reward, _, cut, about = super().step(action)
+        self.count += 1
+        return observation, reward, self.falls and self.count == 5, cut, about
+
+
+@pytest.fixture
+def seed():
+    """Of a run whose first demonstration falls."""
+    from fdtasil.seeding import episode_seeds
+
+    return next(s for s in range(50) if episode_seeds(s, "rollout", 0, 1)[0] % 3 == 0)
+
+
+FALLING = {**QUICK, "episodes": 1, "horizon": 20, "evaluation_episodes": 20, "probes": 0}
+
+
+def test_a_demonstration_that_fell_is_replaced(seed):
+    kept = fdtasil.distill(linear, Falling, keep="survivors", seed=seed, **FALLING)
+    assert not kept.demonstrations.terminated.any()
+    assert len(kept.demonstrations) == 20
+    assert kept.report["replaced_episodes"] >= 1
+    assert kept.queries["act"] == 5 + 20 + 5 * (kept.report["replaced_episodes"] - 1)
+    assert kept.queries["act"] <= kept.report["predicted_queries"]["act"]
+
+
+def test_a_demonstration_that_fell_is_named(seed):
+    share = r"1 of 1 demonstrations ended early, after 5 of 20 steps"
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("fdtasil.run.doubts._USUALLY", 0.5)
+        with pytest.warns(fdtasil.FdtasilWarning, match=share):
+            fdtasil.distill(linear, Falling, seed=seed, **FALLING)
+
+
+def test_nothing_is_recorded_anew_of_a_given_dataset(expert):
+    given = fdtasil.distill(linear, TOY, 0, **QUICK).dataset
+    with pytest.raises(SettingError, match="given dataset"):
+        fdtasil.distill(linear, TOY, dataset=given, keep="survivors")
+    with pytest.raises(SettingError, match="keep="):
+        fdtasil.distill(linear, TOY, keep="best", **QUICK)
