@@ -82,7 +82,7 @@ def _step_on_a_gpu(cell: Cell) -> dict[str, Any]:
     tasks = {
         f"{source}, {device}": (_task(n, m, source, device, steps), steps)
         for source in SOURCES
-        for device, steps in (("cpu", STEPS), ("cuda", Fit().total_steps(STATES)))
+        for device, steps in (("cpu", STEPS), ("cuda", Fit().schedule().total_steps(STATES)))
     }
     times: dict[str, list[float]] = {name: [] for name in tasks}
     for task, _ in tasks.values():

@@ -92,7 +92,7 @@ def test_the_expert_is_asked_as_often_as_predicted(spec, samples):
 
     settings = Fit(steps=20, batch_size=25)
     fit(new_student(), demonstrations, probes, counted, settings, stream)
-    visits = settings.visits(50)
+    visits = settings.schedule().visits(50)
     assert visits == 10
     assert asked == list(range(samples))
     assert probes.samples(6, visits) == samples
@@ -107,7 +107,7 @@ def test_few_states_and_a_state_left_over(states, batches):
     assert history[-1]["step"] == 5
     assert np.isfinite(list(history[-1].values())).all()
     dealt = Batches(demonstrations, None, None, stream, torch.device("cpu"))
-    every = dealt.epoch(0, torch.arange(states), settings.steps_an_epoch(states))
+    every = dealt.epoch(0, torch.arange(states), settings.schedule().steps_an_epoch(states))
     assert [len(batch.observations) for batch in every] == batches
 
 
@@ -155,9 +155,9 @@ def test_equal_seeds_give_equal_weights():
 
 
 def test_steps_and_epochs_are_two_ways_to_say_one_thing():
-    assert Fit(epochs=3).total_steps(200) == 6
-    assert Fit(epochs=3).visits(200) == 3
-    assert Fit(steps=7).visits(200) == 4
+    assert Fit(epochs=3).schedule().total_steps(200) == 6
+    assert Fit(epochs=3).schedule().visits(200) == 3
+    assert Fit(steps=7).schedule().visits(200) == 4
     with pytest.raises(SettingError, match="one of the two"):
         Fit(steps=1, epochs=1)
 
@@ -172,8 +172,8 @@ def test_a_preset_with_other_settings_keeps_the_rest():
 
 
 def test_much_data_is_trained_on_for_longer_unless_steps_are_given():
-    assert [Fit().total_steps(n) for n in (1, 1500, 6000)] == [4000, 4000, 8000]
-    assert Fit(steps=7).total_steps(6000) == 7
+    assert [Fit().schedule().total_steps(n) for n in (1, 1500, 6000)] == [4000, 4000, 8000]
+    assert Fit(steps=7).schedule().total_steps(6000) == 7
 
 
 @pytest.mark.parametrize(

@@ -7,7 +7,7 @@ from pathlib import Path
 import pytest
 
 from fdtasil.shell.main import COMMANDS
-from fdtasil.student.fit import Fit
+from fdtasil.student.schedule import Schedule
 
 ROOT = Path(__file__).parent.parent
 README = (ROOT / "README.md").read_text()
@@ -19,7 +19,7 @@ def test_the_code_runs(tmp_path, monkeypatch):
     """All blocks in turn, as one session, in an empty folder beside the experts."""
     (tmp_path / "experts").symlink_to(ROOT / "experts")
     monkeypatch.chdir(tmp_path)
-    monkeypatch.setattr(Fit, "total_steps", lambda fit, states, **_: 50)  # for the same files
+    monkeypatch.setattr(Schedule, "total_steps", lambda schedule, states: 50)
     session = {}
     for block in BLOCKS:
         exec(compile(block, "README.md", "exec"), session)

@@ -170,7 +170,7 @@ class Configuration:
             collected, episodes = collected + new, episodes + count
             held = round(self.fit.held_out(episodes) * length)
             once = probes.queries(1, self.observation_size, visits=1)
-            visits = self.fit.visits(collected - held, anew=probes.resample)
+            visits = self.fit.schedule(anew=probes.resample).visits(collected - held)
             samples = probes.samples(self.observation_size, visits)
             total += once * new + once * collected * (samples - 1)
         return total

@@ -20,31 +20,13 @@ from fdtasil.student.batches import Batches
 from fdtasil.student.fit_state import FitState
 from fdtasil.student.loss import Minibatch, TaylorLoss, Weights, taylor_loss
 from fdtasil.student.policy import Student
+from fdtasil.student.schedule import ANEW, LOG_EVERY, USUAL, Schedule
 from fdtasil.student.step import gradient_step
 
 __all__ = ["Fit", "Hooks", "fit", "hold_out"]
 
 
-@dataclass(frozen=True)
-class _Length:
-    """How long and how fast is trained where nobody says it.
-
-    Attributes:
-        steps: Gradient steps, up to so many states.
-        states: Beyond them more, by the square root of their number.
-        rate: Peak learning rate.
-    """
-
-    steps: int
-    states: int
-    rate: float
-
-
-_USUAL = _Length(4_000, 1_500, 1e-3)
-# Answers that are asked anew are never learnt by heart: longer and faster goes on teaching.
-_ANEW = _Length(12_000, 13_500, 2e-3)
 _NUMBERS = ("weight_decay", "epsilon", "weight", "curvature_weight", "moved_weight")
-_LOG_EVERY = 100  # steps between two entries of the history; reading a loss waits for the device
 
 
 @dataclass(frozen=True)
@@ -52,10 +34,11 @@ class Fit:
     """How a student is optimised: length, AdamW, the terms of the Taylor loss, validation.
 
     Attributes:
-        steps: Gradient steps of a round. Left out, 4,000, or 12,000 where the expert is asked
-            anew; beyond 1,500 states, or 13,500, more by the square root of their number.
+        steps: Gradient steps of a round. Left out, 4,000, or 20,000 where the expert is asked
+            anew; beyond 1,500 states, or 20,000, more by the square root of their number.
         epochs: Visits of each state in a round, instead of steps.
-        batch_size: States in a minibatch at most; an epoch's are of almost equal size.
+        batch_size: States in a minibatch at most; an epoch's are of almost equal size. Left out,
+            100, or 50 where the expert is asked anew.
         learning_rate: Peak learning rate of AdamW, with cosine decay to zero. Left out, 0.001, or
             0.002 where the expert is asked anew.
         weight_decay: Decoupled weight decay.
@@ -77,13 +60,13 @@ class Fit:
         SettingError: If a value can't be used, or two of them don't go together.
 
     Example:
-        >>> Fit(epochs=10).total_steps(states=1500), Fit().total_steps(states=6000)
-        (150, 8000)
+        >>> Fit(epochs=10).schedule().total_steps(states=1500)
+        150
     """
 
     steps: int | None = None
     epochs: int | None = None
-    batch_size: int = 100
+    batch_size: int | None = None
     learning_rate: float | None = None
     weight_decay: float = 0.01
     epsilon: float = 1e-8
@@ -102,7 +85,7 @@ class Fit:
         for name in _NUMBERS:
             usual = Fit.__dataclass_fields__[name].default
             self._check(name, partial(check_number, example=usual))
-        rate = partial(check_number, positive=True, example=_USUAL.rate)
+        rate = partial(check_number, positive=True, example=USUAL.learning_rate)
         self._check("learning_rate", rate)
         self._check("max_gradient_norm", partial(check_number, positive=True))
         self._check("validation", partial(check_share, whole=False))
@@ -124,15 +107,26 @@ class Fit:
 
     def to_json(self, *, anew: bool = False) -> dict[str, Any]:
         """Return the fields as plain JSON values, and the rule for a length that is left out."""
-        rule: dict[str, Any] = {"steps_for": None, "learning_rate": self.rate(anew=anew)}
-        if self.steps is None and self.epochs is None:
-            usual = _ANEW if anew else _USUAL
-            rule |= {"steps": usual.steps, "steps_for": usual.states}
-        return {**asdict(self), **rule}
+        whole = self.schedule(anew=anew)
+        rule = {"batch_size": whole.batch_size, "learning_rate": whole.learning_rate}
+        if self.epochs is None:
+            rule["steps"] = whole.steps
+        return {**asdict(self), **rule, "steps_for": whole.enough}
 
-    def rate(self, *, anew: bool = False) -> float:
-        """Return the peak learning rate."""
-        return self.learning_rate or (_ANEW if anew else _USUAL).rate
+    def schedule(self, *, anew: bool = False) -> Schedule:
+        """Return the schedule, with what is left out filled in.
+
+        Args:
+            anew: Whether the expert is asked anew on the way.
+        """
+        usual = ANEW if anew else USUAL
+        return Schedule(
+            usual.steps if self.steps is None else self.steps,
+            self.epochs,
+            usual.enough if self.steps is None and self.epochs is None else None,
+            usual.batch_size if self.batch_size is None else self.batch_size,
+            usual.learning_rate if self.learning_rate is None else self.learning_rate,
+        )
 
     def weights(self, match: Match) -> Weights:
         """Return the weights of a loss that holds a student to answers in that way."""
@@ -143,36 +137,11 @@ class Fit:
             self.moved_weight if labels else None,
         )
 
-    def steps_an_epoch(self, states: int) -> int:
-        """Return the minibatches that visit each of `states` states once."""
-        return max(1, -(-states // self.batch_size))
-
-    def total_steps(self, states: int, *, anew: bool = False) -> int:
-        """Return the gradient steps of a training.
-
-        Args:
-            states: Number of states.
-            anew: Whether the expert is asked anew on the way.
-        """
-        if self.epochs is not None:
-            return self.epochs * self.steps_an_epoch(states)
-        if self.steps is not None:
-            return self.steps
-        usual = _ANEW if anew else _USUAL
-        if states <= usual.states:
-            return usual.steps
-        grown = usual.steps * (states / usual.states) ** 0.5
-        return _LOG_EVERY * round(grown / _LOG_EVERY)  # a last entry of a few steps tells little
-
     def held_out(self, episodes: int) -> int:
         """Return how many of `episodes` episodes are held out."""
         if self.validation == 0 or episodes < 2:
             return 0
         return min(max(1, round(self.validation * episodes)), episodes - 1)
-
-    def visits(self, states: int, *, anew: bool = False) -> int:
-        """Return how often each state is visited, the last incomplete epoch counted whole."""
-        return -(-self.total_steps(states, anew=anew) // self.steps_an_epoch(states))
 
 
 @dataclass(frozen=True)
@@ -230,9 +199,9 @@ def fit(
     device = student.mean.device
     batches = Batches(demonstrations, probes, answers, random, device)
     training, held_out = hold_out(demonstrations, settings, random("held out"))
-    per_epoch = settings.steps_an_epoch(len(training))
-    anew = probes is not None and probes.resample
-    steps, rate = settings.total_steps(len(training), anew=anew), settings.rate(anew=anew)
+    schedule = settings.schedule(anew=probes is not None and probes.resample)
+    per_epoch = schedule.steps_an_epoch(len(training))
+    steps, rate = schedule.total_steps(len(training)), schedule.learning_rate
     told.begin(steps)
     optimiser = torch.optim.AdamW(
         student.parameters(),
@@ -245,7 +214,7 @@ def fit(
     weights = settings.weights(probes.match if probes else "differences")
     stencil = probes.stencil if probes else None
     # Taken once, of the first sample: two validations then differ by the student alone.
-    parts = held_out.to(device).split(settings.batch_size)
+    parts = held_out.to(device).split(schedule.batch_size)
     judges = [batches.visit(part, 0) for part in parts if len(part)]
     state = FitState(student, optimiser)
     if resume is not None:
@@ -265,7 +234,7 @@ def fit(
         if state.step % per_epoch == 0 and state.step > 0:
             told.checkpoint(state)
         state.count(step(batch, _cosine(rate, state.step, steps)))
-        if state.step % _LOG_EVERY == 0 or state.step == steps:
+        if state.step % LOG_EVERY == 0 or state.step == steps:
             held = _held_out_loss(loss_of, judges)
             told.entry(state.log(held))
             if settings.patience is not None and state.stale >= settings.patience:
