@@ -1,6 +1,8 @@
 """Do the defaults keep their promise: the expert's return, and never worse than plain cloning."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
+from statistics import mean
+from typing import Any
 
 from benchmarks.controllers import available
 from benchmarks.distillation import distillations
@@ -13,11 +15,12 @@ __all__ = ["BENCHMARK"]
 
 # Episodes and steps: the usual budget, little data, and the whole length of an episode.
 BUDGETS = ((5, 300), (2, 300), (1, 300), (5, 1000))
-PROBES = (10, 0)
+FRESH, STORED, PLAIN = PROBES = ("fresh", 10, 0)  # these experts' default is the first
+_NAMES = {PLAIN: "plain cloning", STORED: "10 probes", FRESH: "fresh"}
 
 
 def cells(quick: bool) -> list[Cell]:
-    """Every expert, budget and seed, with and without probes."""
+    """Every expert, budget and seed, with fresh and stored probes, and without."""
     experts = available("HalfCheetah-v5") if quick else available()
     return [
         {"expert": e, "probes": p, "episodes": n, "horizon": t, "seed": seed}
@@ -29,9 +32,11 @@ def cells(quick: bool) -> list[Cell]:
 
 
 def draw(rows: Sequence[Row]) -> dict[str, bytes]:
-    """One table: experts and budgets down, plain cloning and probes across."""
-    heads = ["expert", "episodes x steps", "plain cloning", "10 probes"]
-    heads += ["paired difference, 95 %", "worst seed", "survival, expert and student", "seconds"]
+    """One table: experts and budgets down, plain cloning, stored and fresh probes across."""
+    heads = ["expert", "episodes x steps", *reversed(_names())]
+    heads += [f"{_NAMES[FRESH]} - {_NAMES[other]}, 95 %" for other in (STORED, PLAIN)]
+    heads += [f"{_NAMES[STORED]} - {_NAMES[PLAIN]}, 95 %"]
+    heads += ["worst seeds, stored and fresh", "survival, expert, stored and fresh", "seconds"]
     lines: list[list[str]] = []
     experts = list(dict.fromkeys(row["cell"]["expert"] for row in rows))
     for episodes, horizon in BUDGETS:
@@ -46,29 +51,51 @@ def draw(rows: Sequence[Row]) -> dict[str, bytes]:
     return {"quality.md": table(heads, lines).encode()}
 
 
+def _names() -> list[str]:
+    return [_NAMES[probes] for probes in PROBES]
+
+
+Results = Mapping[int, Mapping[str, Any]]  # by seed
+
+
 def _line(rows: Sequence[Row], head: list[str]) -> list[list[str]]:
     """Return the line of an expert and budget, or none where two seeds are not there yet."""
-    by_probes = {
+    found = {
         probes: {
             row["cell"]["seed"]: row["result"] for row in rows if row["cell"]["probes"] == probes
         }
         for probes in PROBES
     }
-    ours, plain = (by_probes[probes] for probes in PROBES)
-    if len(ours.keys() & plain.keys()) < 2:
+    if len(found[STORED].keys() & found[PLAIN].keys()) < 2:
         return []
-    score = {seed: result["normalized_return"] for seed, result in ours.items()}
-    base = {seed: result["normalized_return"] for seed, result in plain.items()}
-    difference = paired_difference(score, base)
-    survival = [
-        sum(result[name] for result in ours.values()) / len(ours)
-        for name in ("expert_survival", "survival")
-    ]
-    seconds = sum(result["train_seconds"] for result in ours.values()) / len(ours)
-    cells = [interval_text(list(base.values())), interval_text(list(score.values()))]
-    cells += [difference_text(*difference, 3), f"{min(score.values()):.2f}"]
-    cells += [f"{survival[0]:.2f}, {survival[1]:.2f}", f"{seconds:.0f}"]
-    return [[*head, *cells]]
+    line = [*head, *(_score_text(found[probes]) for probes in reversed(PROBES))]
+    pairs = ((FRESH, STORED), (FRESH, PLAIN), (STORED, PLAIN))
+    line += [_difference_text(found[ours], found[theirs]) for ours, theirs in pairs]
+    asked = (STORED, FRESH)
+    line.append(", ".join(_text(min, found[probes], "normalized_return") for probes in asked))
+    lasts = [_text(mean, found[STORED], "expert_survival")]
+    lasts += [_text(mean, found[probes], "survival") for probes in asked]
+    seconds = [_text(mean, found[probes], "train_seconds", 0) for probes in asked]
+    return [[*line, ", ".join(lasts), ", ".join(seconds)]]
+
+
+def _score_text(results: Results) -> str:
+    scores = [result["normalized_return"] for result in results.values()]
+    return interval_text(scores) if len(scores) > 1 else "-"
+
+
+def _difference_text(ours: Results, theirs: Results) -> str:
+    if len(ours.keys() & theirs.keys()) < 2:
+        return "-"
+    scores = (
+        {seed: result["normalized_return"] for seed, result in results.items()}
+        for results in (ours, theirs)
+    )
+    return difference_text(*paired_difference(*scores), 3)
+
+
+def _text(of: Callable[..., float], results: Results, name: str, digits: int = 2) -> str:
+    return f"{of(r[name] for r in results.values()):.{digits}f}" if results else "-"
 
 
 BENCHMARK = distillations("quality", __doc__ or "", cells, dict, draw)

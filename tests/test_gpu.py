@@ -17,7 +17,15 @@ from fdtasil.student.step import gradient_step
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 
-SPECS = [None, "4", "basis,central", "orthogonal:6", "sphere:2,resample", "sphere:3,labels"]
+SPECS = [
+    None,
+    "4",
+    "basis,central",
+    "orthogonal:6",
+    "sphere:2,resample",
+    "sphere:3,labels",
+    "fresh:2",
+]
 
 
 def train(spec, device="cuda", resume=None, checkpoint=lambda state: None, **changes):
@@ -107,13 +115,14 @@ def minibatches():
     for number in range(20):
         rows = 10 + (number > 9)  # the second shape comes up when the first is recorded
         draws = [torch.randn(rows, size, generator=random).to("cuda") for size in (6, 2)]
-        around = ProbeBatch(draws[0][:, None], draws[1][:, None, None], 1.0 + (number > 14))
+        gains = torch.full((rows, 1), 1.0 + (number > 14), device="cuda")
+        around = ProbeBatch(draws[0][:, None], draws[1][:, None, None], gains)
         yield Minibatch(*draws, around)
 
 
 def loss_of(student, batch):
     error = (student(batch.observations) - batch.actions).norm(dim=1).mean()
-    return TaylorLoss(*[batch.probes.gain * error] * 4)
+    return TaylorLoss(*[batch.probes.gains.mean() * error] * len(TaylorLoss._fields))
 
 
 class Expert(torch.nn.Module):
@@ -136,6 +145,7 @@ class Expert(torch.nn.Module):
         {"probes": "jacobian", "fit": Fit(steps=40, order=2)},
         {"probes": "basis,central", "fit": Fit(steps=40, order=2)},
         {"probes": "sphere:2,resample"},
+        {"probes": "fresh"},
         {"probes": 5, "fit": Fit(steps=40, validation=0.5, patience=1)},
     ],
     ids=str,

@@ -40,7 +40,7 @@ class FitState:
         self._best: dict[str, Tensor] = {}
 
     def count(self, losses: Tensor) -> None:
-        """Count one step, with the (4,) numbers of its `TaylorLoss`."""
+        """Count one step, with the numbers of its `TaylorLoss`."""
         self.step += 1
         self._recent.append(losses)
 

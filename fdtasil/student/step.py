@@ -11,7 +11,7 @@ from fdtasil.student.loss import Minibatch, ProbeBatch, TaylorLoss
 __all__ = ["Step", "copy_of", "gradient_step", "tensors_of"]
 
 Step = Callable[[Minibatch, float], Tensor]
-"""Takes a step on a minibatch at a learning rate, and returns its loss and parts as (4,)."""
+"""Takes a step on a minibatch at a learning rate, and returns its `TaylorLoss` as one tensor."""
 
 # Steps before the first recording, on its stream: AdamW's moments and cuBLAS's workspace must be
 # there, for what is made while recording belongs to that one recording.
