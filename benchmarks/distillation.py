@@ -9,7 +9,7 @@ from benchmarks.controllers import CONTROLLERS
 from benchmarks.runner import Benchmark, Cell, Row
 from fdtasil.run.presets import preset_of
 
-__all__ = ["HORIZON", "STEPS", "call_of", "distillations", "usual_arguments"]
+__all__ = ["HORIZON", "STEPS", "call_of", "distil", "distillations", "usual_arguments"]
 
 HORIZON = 300
 STEPS = 4_000  # of all, however much data they have: none is trained longer than another
@@ -34,7 +34,7 @@ def distillations(
     """
 
     def run(cell: Cell, device: str) -> dict[str, Any]:
-        return _distil(**arguments(cell), device=device)
+        return distil(**arguments(cell), device=device)
 
     return Benchmark(name, about, cells, run, draw, arguments=arguments)
 
@@ -64,7 +64,7 @@ def call_of(settings: Mapping[str, Any]) -> dict[str, Any]:
     return {**rest, "student": fdtasil.Mlp(**of_student), "fit": preset.fit_with(**of_fit)}
 
 
-def _distil(expert: str, **settings: Any) -> dict[str, Any]:
+def distil(expert: str, **settings: Any) -> dict[str, Any]:
     """Distil, and return what tables and figures need of the report."""
     path, environment = CONTROLLERS[expert].open()
     result = fdtasil.distill(path, environment, progress=False, **call_of(settings))

@@ -1,0 +1,107 @@
+"""What makes most of one or five trajectories: fresh queries and their rivals."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+
+import fdtasil
+from benchmarks.comparison import draw_methods, scores_of
+from benchmarks.controllers import CONTROLLERS
+from benchmarks.distillation import HORIZON, call_of, distil
+from benchmarks.grid import SEEDS, experts
+from benchmarks.runner import Benchmark, Cell, Row
+from fdtasil.probes.answers import Answers
+from fdtasil.probes.scales import measure_scales
+
+__all__ = ["BENCHMARK", "with_neighbours"]
+
+BUDGETS = (1, 5)
+NEIGHBOURS = 10
+_APART = 10  # rows: a state's neighbours in time differ from it by next to nothing
+METHODS: dict[str, dict[str, Any]] = {
+    "plain": {"probes": 0},
+    "neighbours": {},
+    "noise": {"probes": 0, "trainer": "noise"},
+    "10 probes": {"probes": 10},
+    "10 probes, noise": {"probes": 10, "trainer": "noise"},
+    "10 probes, both": {"probes": "10,both"},
+    "fresh": {"probes": "fresh"},
+    "fresh labels": {"probes": "fresh,labels"},
+    "fresh, noise": {"probes": "fresh", "trainer": "noise"},
+}
+PAIRS = (
+    ("fresh", "fresh labels"),
+    ("fresh", "10 probes"),
+    ("fresh", "noise"),
+    ("fresh", "fresh, noise"),
+    ("10 probes, both", "10 probes"),
+    ("neighbours", "plain"),
+)
+
+
+def cells(quick: bool) -> list[Cell]:
+    """Every budget, seed, expert and method."""
+    names = experts()
+    return [
+        {"expert": expert, "episodes": budget, "method": method, "seed": seed}
+        for budget in (BUDGETS[:1] if quick else BUDGETS)
+        for seed in (range(2) if quick else SEEDS)
+        for expert in (names[:1] if quick else names)
+        for method in METHODS
+    ]
+
+
+def measure(cell: Cell, device: str) -> dict[str, Any]:
+    """Distil with one method, default settings otherwise."""
+    shape = {name: cell[name] for name in ("expert", "episodes", "seed")}
+    settings = {**shape, "horizon": HORIZON, "device": device, **METHODS[cell["method"]]}
+    if cell["method"] != "neighbours":
+        return distil(**settings)
+    recorded = _recorded(**settings)
+    rest = {name: settings[name] for name in ("expert", "seed", "horizon", "device")}
+    return distil(dataset=with_neighbours(recorded), **rest)
+
+
+def _recorded(expert: str, **settings: Any) -> fdtasil.Dataset:
+    path, environment = CONTROLLERS[expert].open()
+    call = call_of({**settings, "probes": 0, "evaluation_episodes": 0, "steps": 1})
+    return fdtasil.distill(
+        path, environment, progress=False, **call_of(settings | nothing)
+    ).dataset
+
+
+def with_neighbours(dataset: fdtasil.Dataset) -> fdtasil.Dataset:
+    """Return a dataset whose probes lead to other demonstrated states: nobody is asked.
+
+    Differences between neighbouring states and their actions stand in for derivatives (Kissel and
+    Diepold, ECML 2019).
+    """
+    states = dataset.demonstrations
+    scales = measure_scales(states.observations)
+    whitened = (states.observations / scales.deviation)[:, scales.live].astype(np.float64)
+    squares = (whitened**2).sum(axis=1)
+    distances = squares[:, None] + squares - 2 * whitened @ whitened.T
+    rows = np.arange(len(whitened))
+    distances[np.abs(rows[:, None] - rows) < _APART] = np.inf
+    nearest = np.argsort(distances, axis=1)[:, :NEIGHBOURS]
+    displacements = states.observations[nearest] - states.observations[:, None]
+    lengths = np.linalg.norm(whitened[nearest] - whitened[:, None], axis=2)
+    answers = Answers(
+        displacements.reshape(-1, displacements.shape[-1]),
+        np.arange(nearest.size, dtype=np.int32).reshape(nearest.shape),
+        states.actions[nearest][:, :, None],
+        scales.live.sum() ** 0.5 / np.maximum(lengths, 1e-3).reshape(-1),
+    )
+    source = fdtasil.Probes.parse(f"sphere:{NEIGHBOURS},forward,whitened,radius=1,per_step=1")
+    return replace(dataset, probes=source, answers=answers)
+
+
+def draw(rows: Sequence[Row]) -> dict[str, bytes]:
+    """The picture and the tables of the groups that are complete."""
+    scores = scores_of(rows, list(METHODS), len(SEEDS))
+    return draw_methods("few_trajectories", scores, list(METHODS), PAIRS)
+
+
+BENCHMARK = Benchmark("few_trajectories", __doc__ or "", cells, measure, draw)
