@@ -67,9 +67,7 @@ def measure(cell: Cell, device: str) -> dict[str, Any]:
 def _recorded(expert: str, **settings: Any) -> fdtasil.Dataset:
     path, environment = CONTROLLERS[expert].open()
     call = call_of({**settings, "probes": 0, "evaluation_episodes": 0, "steps": 1})
-    return fdtasil.distill(
-        path, environment, progress=False, **call_of(settings | nothing)
-    ).dataset
+    return fdtasil.distill(path, environment, progress=False, **call).dataset
 
 
 def with_neighbours(dataset: fdtasil.Dataset) -> fdtasil.Dataset:
