@@ -61,7 +61,8 @@ def call_of(settings: Mapping[str, Any]) -> dict[str, Any]:
         for kind in (fdtasil.Fit, fdtasil.Mlp)
     )
     preset = preset_of(rest.get("preset", "standard"))
-    return {**rest, "student": fdtasil.Mlp(**of_student), "fit": preset.fit_with(**of_fit)}
+    student = fdtasil.Mlp(**of_student) if of_student else None
+    return {**rest, "student": student, "fit": preset.fit_with(**of_fit)}
 
 
 def distil(expert: str, **settings: Any) -> dict[str, Any]:

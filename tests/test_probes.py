@@ -122,7 +122,9 @@ def test_short_specs():
     assert Probes.parse("10,central") == Probes.parse("adaptive:10,central")
     assert Probes.parse("sphere") == Probes.parse("sphere:10")
     assert Probes.parse("fresh") == Probes.parse("10,both,resample,radius=wide")
-    assert Probes.parse("fresh:3,differences") == Probes.parse("3,resample,radius=wide")
+    assert Probes.parse("fresh:3,differences") == Probes.parse(
+        "3,differences,resample,radius=wide"
+    )
 
 
 @pytest.mark.fault(84, 86)

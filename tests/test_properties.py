@@ -226,7 +226,7 @@ sources = st.builds(
     space=st.sampled_from([None, "whitened", "raw"]),
     resample=st.booleans(),
     per_step=st.none() | st.just("all") | counts,
-    match=st.sampled_from(["differences", "labels", "both"]),
+    match=st.sampled_from([None, "differences", "labels", "both"]),
 ) | st.builds(Probes, st.just(Jacobian()), st.just(EXACT) | st.none(), radius=radii)
 
 

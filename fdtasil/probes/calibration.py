@@ -11,7 +11,7 @@ from fdtasil.experts.expert import Expert
 from fdtasil.files.plain import from_plain, to_plain
 from fdtasil.probes.answers import ask_moved
 from fdtasil.probes.scales import Scales
-from fdtasil.probes.source import Probes
+from fdtasil.probes.source import Match, Probes
 from fdtasil.probes.stencils import CENTRAL, FORWARD
 
 __all__ = ["WIDE", "Calibration", "Ladder", "calibrate", "ladder_for"]
@@ -50,6 +50,10 @@ _COHERENT = 0.75
 # controller, which are smooth at most states, 0.5, trees and int8 less.
 _ROUGH = 0.62
 _ROUGH_RADIUS = 0.5
+# Change of an action at the radius, in units of its deviation over the states, above which the law
+# is steep for the scale that it is probed at: a swing-up that ends in a stiff balance has 2.4,
+# networks that walk 0.5 to 1. Differences alone then count more than the actions do.
+_STEEP = 1.5
 _NOISY_FROM = 4.0**-6  # smallest radius with a derivative; float32 rounding stays below it
 _NOISY_SHARE = 0.3  # of noise in a difference; above it a given radius is warned of
 WIDE = (0.05, 2.0)
@@ -73,6 +77,7 @@ class Calibration:
             radius, where nothing but rounding and noise is left of them.
         radius: Suggested, in standard deviations of each coordinate.
         stencil: Suggested, "forward" or "central".
+        match: Suggested, "differences" or "both".
         similarity: Secant similarity at each radius and a quarter of it; the first is NaN.
         change: Root mean square change of an action at each radius.
         radii: The radii, ascending.
@@ -87,6 +92,7 @@ class Calibration:
     change: tuple[float, ...]
     radii: tuple[float, ...]
     queries: int
+    match: Match = "differences"  # of calibrations that are older than the others
 
     def complete(self, probes: Probes) -> Probes:
         """Return the source with what it leaves open filled in; warn of a radius that misleads."""
@@ -97,7 +103,8 @@ class Calibration:
             for end in sorted(set(replace(probes, radius=radius).reaches)):
                 self._warn_of(end)
         stencil = CENTRAL if self.stencil == "central" else FORWARD
-        return replace(probes, radius=radius, stencil=probes.stencil or stencil)
+        match = probes.match or self.match
+        return replace(probes, radius=radius, stencil=probes.stencil or stencil, match=match)
 
     def _nearest(self) -> float:
         """Return the smallest radius at which differences say something of the expert."""
@@ -178,6 +185,7 @@ def calibrate(
     floor = float(np.sqrt((second**2).mean() / 6))
     change = np.sqrt(((values - centres[:, None, None, :]) ** 2).mean(axis=(0, 2, 3)))
     regime, radius, stencil = _judge(similarity, radii[1:], usual)
+    steep = np.interp(np.log(radius), np.log(radii), change) > _STEEP * centres.std(axis=0).mean()
     return Calibration(
         regime,
         floor,
@@ -187,6 +195,7 @@ def calibrate(
         tuple(change.tolist()),
         tuple(radii.tolist()),
         ladder.queries,
+        "both" if steep else "differences",
     )
 
 

@@ -52,7 +52,8 @@ class Probes:
         per_step: How many of a state's probes one visit of the state uses, or "all" (the cost of
             a training step then grows with their number). None leaves it to the preset.
         match: "differences" between moved and demonstrated states; "labels", the answers at the
-            moved states as they are (data augmentation); or "both".
+            moved states as they are (data augmentation); or "both". None leaves it to the
+            calibration, or is the differences.
 
     Example:
         >>> Probes.parse("sphere:5,resample") == Probes(RandomSphere(5), resample=True)
@@ -67,14 +68,15 @@ class Probes:
     space: Literal["whitened", "raw"] | None = None
     resample: bool = False
     per_step: int | Literal["all"] | None = None
-    match: Match = "differences"
+    match: Match | None = None
 
     def __post_init__(self) -> None:
         if self.radius is not None:
             object.__setattr__(self, "radius", _checked_radius(self.radius))
         if self.space is not None:
             check_choice("space", self.space, ("whitened", "raw"))
-        check_choice("match", self.match, _MATCHES)
+        if self.match is not None:
+            check_choice("match", self.match, _MATCHES)
         object.__setattr__(self, "resample", check_flag("resample", self.resample))
         if not isinstance(self.directions, tuple(DIRECTIONS.values())) or not isinstance(
             self.stencil, Stencil | None
@@ -91,7 +93,7 @@ class Probes:
                 "a finite stencil with asked directions, and none with differentiated ones",
                 'write probes="jacobian" for the exact derivative',
             )
-        if self.exact and self.match != "differences":
+        if self.exact and self.has_labels:
             raise SettingError(
                 f"match={self.match!r} with exact derivatives",
                 "answers at moved states, of which there are none",
@@ -134,7 +136,7 @@ class Probes:
         """Return the text that `parse` reads back, with the radius where it is set."""
         parts = [_describe(self.directions)]
         parts += [self.stencil.name] if self.stencil not in (None, EXACT) else []
-        parts += [self.match] if self.match != "differences" else []
+        parts += [self.match] if self.match else []
         parts += ["resample"] if self.resample else []
         parts += [self.space] if self.space else []
         parts += [f"radius={radius_text(self.radius)}"] if self.radius is not None else []
@@ -145,6 +147,11 @@ class Probes:
     def exact(self) -> bool:
         """Whether the expert is differentiated, and not asked."""
         return self.stencil is not None and self.stencil.exact
+
+    @property
+    def has_labels(self) -> bool:
+        """Whether the answers at the moved states are matched as they are."""
+        return self.match in ("labels", "both")
 
     @property
     def reaches(self) -> tuple[float, float]:
@@ -162,7 +169,7 @@ class Probes:
         Raises:
             SettingError: If the stencil that was asked for has none of second order.
         """
-        if self.match != "differences":
+        if self.has_labels:
             usual = FORWARD  # a label needs no other side
         stencil = self.stencil or (CENTRAL if order == 2 else usual)
         if order == 2 and self.match == "labels":

@@ -19,7 +19,7 @@ from fdtasil.run.configuration import Configuration
 from fdtasil.run.presets import Preset, preset_of
 from fdtasil.run.subject import Subject
 from fdtasil.seeding import episode_seeds
-from fdtasil.student.architectures import Architecture, check_architecture
+from fdtasil.student.architectures import Architecture, check_architecture, usual_architecture
 from fdtasil.student.fit import Fit
 from fdtasil.student.view import StudentObservation, describe_view
 
@@ -42,7 +42,7 @@ class Arguments:
         episodes: Number of demonstrations.
         horizon: T, or None for the environment's own.
         seed: The one seed.
-        student: The architecture of its network.
+        student: The architecture of its network, or None for the usual one.
         student_obs: What it sees.
         keep: Which demonstrations are kept.
         spread: How far coordinates will go that hardly move in the demonstrations.
@@ -60,7 +60,7 @@ class Arguments:
     episodes: int
     horizon: int | None
     seed: int
-    student: Architecture
+    student: Architecture | None
     student_obs: StudentObservation | None
     keep: str
     spread: SpreadLike | None
@@ -86,7 +86,10 @@ class Arguments:
             return replace(usual, reason="asked once: what a query costs is not known")
         if work > CHEAP:
             return replace(usual, reason=f"asked once: {work:,} multiply-adds a query")
-        anew = replace(usual, probes=self.anew, calibrated=True, probes_given=False)
+        student = self.student or usual_architecture(anew=True)
+        anew = replace(
+            usual, probes=self.anew, calibrated=True, probes_given=False, student=student
+        )
         due = sum(anew.predicted_queries().values())
         if self.max_queries is not None and due > self.max_queries:
             return replace(usual, reason=f"asked once: {due:,} queries are more than max_queries")
@@ -111,7 +114,7 @@ class Arguments:
             probes_given=stored,
             observation_size=subject.observation_size,
             student_obs=describe_view(self.student_obs, subject.observation_size),
-            student=self.student,
+            student=self.student or usual_architecture(anew=bool(source and source.resample)),
             fit=self.fit,
             episodes=self.episodes,
             horizon=horizon,
@@ -140,7 +143,7 @@ def read_arguments(
     episodes: int | None,
     horizon: int | None,
     seed: int,
-    student: Architecture,
+    student: Architecture | None,
     student_obs: StudentObservation | None,
     keep: str,
     spread: SpreadLike | None,
@@ -166,7 +169,7 @@ def read_arguments(
         episodes=_episodes_of(episodes, given),
         horizon=None if horizon is None else check_count("horizon", horizon),
         seed=check_count("seed", seed, 0, 2**32 - 1),
-        student=check_architecture(student),
+        student=None if student is None else check_architecture(student),
         student_obs=student_obs,
         keep=_checked_keep(keep, given),
         spread=spread,
@@ -230,7 +233,10 @@ def _source_of(
         left_open = preset.calibrates(asked) and not curved
         return asked.with_order(order, None if left_open else FORWARD)
     asked = replace(  # what was left open was found by a calibration, and is stored
-        asked, radius=asked.radius or stored.radius, stencil=asked.stencil or stored.stencil
+        asked,
+        radius=asked.radius or stored.radius,
+        stencil=asked.stencil or stored.stencil,
+        match=asked.match or stored.match,
     ).with_order(order)
     if asked != stored:
         raise SettingError(

@@ -36,7 +36,7 @@ from fdtasil.run.rounds import Rounds
 from fdtasil.run.subject import Subject, open_subject
 from fdtasil.run.training import Training
 from fdtasil.seeding import episode_seeds
-from fdtasil.student.architectures import Architecture, Mlp
+from fdtasil.student.architectures import Architecture
 from fdtasil.student.fit import Fit
 from fdtasil.student.view import StudentObservation, View, view_size
 
@@ -52,7 +52,7 @@ def distill(
     episodes: int | None = None,
     horizon: int | None = None,
     seed: int = 0,
-    student: Architecture = Mlp(),
+    student: Architecture | None = None,
     student_obs: StudentObservation | None = None,
     keep: str = "all",
     spread: SpreadLike | None = None,
@@ -96,7 +96,8 @@ def distill(
         episodes: Number of demonstrations. Left out, 20, or those of `dataset`.
         horizon: Steps after which an episode is cut; default: the environment's time limit.
         seed: Equal seeds give equal bytes, on one machine with the same versions.
-        student: The architecture of its network, `fdtasil.Mlp(hidden, activation)`.
+        student: The architecture of its network, `fdtasil.Mlp(hidden, activation)`. Left out, two
+            hidden layers of 512, or of 256 where the expert is asked anew.
         student_obs: Indices of the coordinates that the student sees, or a function
             (B, n) -> (B, k); the expert sees all. Probes move only what the student sees.
         keep: Which of the expert's own episodes are learnt from: "all", or "survivors", which
@@ -135,11 +136,12 @@ def distill(
         StorageError: If the run's folder can't be written, or holds something else.
 
     Example:
+        >>> import fdtasil
         >>> import numpy as np
         >>> result = distill(
         ...     lambda x: np.clip(-8 * np.arctan2(x[:, 1:2], x[:, :1]) - 2 * x[:, 2:], -2, 2),
         ...     "Pendulum-v1", probes=4, episodes=2, horizon=50, evaluation_episodes=2,
-        ...     student=Mlp(16), fit=Fit(steps=50),
+        ...     student=fdtasil.Mlp(16), fit=Fit(steps=50),
         ... )
         >>> result.student.predict(result.demonstrations.observations[0])[0].shape
         (1,)

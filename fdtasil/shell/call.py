@@ -31,13 +31,14 @@ def distil(arguments: Arguments, *, progress: bool = True) -> Distilled:
     """
     rest = dict(arguments)
     fit = {field.name: rest.pop(field.name) for field in fields(Fit)}
-    network = {field.name: rest.pop(field.name) for field in fields(Mlp)}
+    said = {field.name: rest.pop(field.name) for field in fields(Mlp)}
+    network = {name: value for name, value in said.items() if value is not None}
     output, trust, formats = (rest.pop(name) for name in ("output", "trust", "log_formats"))
     rest["expert"] = opened(rest["expert"], rest["env"], output=output, trust=trust)
     folder = Path(rest["out"] or rest["resume"] or ".")
     return distill(
         **rest,
-        student=Mlp(**{name: value for name, value in network.items() if value is not None}),
+        student=Mlp(**network) if network else None,
         fit=preset_of(rest["preset"]).fit_with(**fit),
         callback=Log(folder / "log", *formats) if formats else None,
         progress=progress,

@@ -34,13 +34,12 @@ class Fit:
     """How a student is optimised: length, AdamW, the terms of the Taylor loss, validation.
 
     Attributes:
-        steps: Gradient steps of a round. Left out, 4,000, or 20,000 where the expert is asked
-            anew; beyond 1,500 states, or 20,000, more by the square root of their number.
+        steps: Gradient steps of a round. Left out, 4,000, or 12,000 where the expert is asked
+            anew; beyond 1,500 states, or 13,500, more by the square root of their number.
         epochs: Visits of each state in a round, instead of steps.
-        batch_size: States in a minibatch at most; an epoch's are of almost equal size. Left out,
-            100, or 50 where the expert is asked anew.
+        batch_size: States in a minibatch at most; an epoch's are of almost equal size.
         learning_rate: Peak learning rate of AdamW, with cosine decay to zero. Left out, 0.001, or
-            0.002 where the expert is asked anew.
+            0.004 where the expert is asked anew.
         weight_decay: Decoupled weight decay.
         epsilon: AdamW's epsilon.
         order: Of the Taylor loss: 1, or 2 to match second differences too (central stencil, or
@@ -66,7 +65,7 @@ class Fit:
 
     steps: int | None = None
     epochs: int | None = None
-    batch_size: int | None = None
+    batch_size: int = 100
     learning_rate: float | None = None
     weight_decay: float = 0.01
     epsilon: float = 1e-8
@@ -108,10 +107,9 @@ class Fit:
     def to_json(self, *, anew: bool = False) -> dict[str, Any]:
         """Return the fields as plain JSON values, and the rule for a length that is left out."""
         whole = self.schedule(anew=anew)
-        rule = {"batch_size": whole.batch_size, "learning_rate": whole.learning_rate}
-        if self.epochs is None:
-            rule["steps"] = whole.steps
-        return {**asdict(self), **rule, "steps_for": whole.enough}
+        steps = None if self.epochs else whole.steps
+        rule = {"steps": steps, "steps_for": whole.enough, "learning_rate": whole.learning_rate}
+        return {**asdict(self), **rule}
 
     def schedule(self, *, anew: bool = False) -> Schedule:
         """Return the schedule, with what is left out filled in.
@@ -124,13 +122,13 @@ class Fit:
             usual.steps if self.steps is None else self.steps,
             self.epochs,
             usual.enough if self.steps is None and self.epochs is None else None,
-            usual.batch_size if self.batch_size is None else self.batch_size,
+            self.batch_size,
             usual.learning_rate if self.learning_rate is None else self.learning_rate,
         )
 
-    def weights(self, match: Match) -> Weights:
+    def weights(self, match: Match | None) -> Weights:
         """Return the weights of a loss that holds a student to answers in that way."""
-        labels, differences = match != "differences", match != "labels"
+        labels, differences = match in ("labels", "both"), match != "labels"
         return Weights(
             self.weight if differences else None,
             self.curvature_weight if differences and self.order == 2 else None,
@@ -211,7 +209,7 @@ def fit(
         fused=True,
         capturable=device.type == "cuda",
     )
-    weights = settings.weights(probes.match if probes else "differences")
+    weights = settings.weights(probes.match if probes else None)
     stencil = probes.stencil if probes else None
     # Taken once, of the first sample: two validations then differ by the student alone.
     parts = held_out.to(device).split(schedule.batch_size)
