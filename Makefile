@@ -7,8 +7,8 @@ export OMP_NUM_THREADS = 1
 .PHONY: demo test torture lint types wheel check clean
 
 demo: .venv/ready
-	$(BIN)/fdtasil distill experts/HalfCheetah-v5.onnx HalfCheetah-v5 --probes 10 \
-		--episodes 5 --horizon 300 --baseline --out runs/demo
+	$(BIN)/fdtasil distill experts/HalfCheetah-v5.onnx HalfCheetah-v5 \
+		--episodes 1 --horizon 300 --baseline --out runs/demo
 
 test: .venv/ready
 	$(BIN)/python -m pytest -q -n 2 -m "not slow"
