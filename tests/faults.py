@@ -212,6 +212,11 @@ FAULTS = {
         191: "too few file descriptors",
         192: "a warning that names the caller's own line",
     },
+    "what demonstrations lack": {
+        203: "a law that is steep for the scale that it is probed at",
+        204: "coordinates that stand still within an episode",
+        205: "a demonstration that fell, of an expert that lasts",
+    },
 }
 
 LEFT_OUT: dict[int, str] = {}

@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -11,8 +11,9 @@ from fdtasil.errors import SettingError
 
 __all__ = ["Spread", "SpreadLike", "stands_still"]
 
-SpreadLike = Mapping[int, float] | Literal["bounds"]
-"""Coordinate -> the deviation that it is probed by; or those of uniform values in their bounds."""
+SpreadLike = Mapping[int, float] | str
+"""Coordinate -> the deviation that it is probed by, as a text "3:0.5,7:0.1" too; or "bounds", the
+deviations of uniform values in the bounds of the observations."""
 
 _STILL = 1e-3  # of what a coordinate varies between episodes, that it may vary within one
 _EXPECTED = 'a deviation for each coordinate, or "bounds"'
@@ -38,7 +39,7 @@ class Spread:
         """Read the argument `spread`.
 
         Args:
-            given: Deviations by coordinate; "bounds", or None for none.
+            given: Deviations by coordinate, "bounds", or None for none.
             low: (n,) bounds of the observations, or None where there is no environment.
             high: (n,) upper bounds.
             n: Length of an observation.
@@ -48,6 +49,8 @@ class Spread:
         """
         if given is None:
             return cls({})
+        if isinstance(given, str) and given != "bounds":
+            given = _read(given)
         if isinstance(given, Mapping):
             read = {
                 check_count("a coordinate of spread", key, 0, n - 1): check_number(
@@ -56,7 +59,7 @@ class Spread:
                 for key, value in given.items()
             }
             return cls(dict(sorted(read.items())))
-        if not isinstance(given, str) or given != "bounds":
+        if given != "bounds":
             raise SettingError(spelt("spread", given), _EXPECTED, _EXAMPLE)
         if (
             low is None
@@ -80,6 +83,15 @@ class Spread:
     def to_json(self) -> dict[str, Any] | None:
         """Return the deviations by coordinate as plain JSON values, or None without any."""
         return {str(i): d for i, d in self.deviations.items()} or None
+
+
+def _read(text: str) -> dict[int, float]:
+    """Read "3:0.5,7:0.1"."""
+    try:
+        pairs = (part.split(":") for part in text.split(","))
+        return {int(coordinate): float(deviation) for coordinate, deviation in pairs}
+    except ValueError:
+        raise SettingError(spelt("spread", text), _EXPECTED, _EXAMPLE) from None
 
 
 def stands_still(observations: np.ndarray, episode: np.ndarray) -> np.ndarray:

@@ -103,8 +103,9 @@ def distill(
         keep: Which of the expert's own episodes are learnt from: "all", or "survivors", which
             records others (three at most) in the place of each that the environment ended.
         spread: How far coordinates will go on the machine that stand still in the demonstrations,
-            such as a command, a goal or a mass: {coordinate: deviation}, or "bounds" for those
-            that have finite ones. They are probed that far, alone and together with the others.
+            such as a command, a goal or a mass: {coordinate: deviation}, as a text "3:0.5,7:0.1"
+            too, or "bounds" for those that have finite ones. They are probed that far, alone and
+            together with the others.
         fit: Length, optimiser, order and weights of the loss, validation: `fdtasil.Fit(...)`.
             Left out, the preset's.
         preset: Where defaults of probes and fit come from: "standard", or "paper" (TaSIL's

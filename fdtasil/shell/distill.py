@@ -193,6 +193,7 @@ command = as_command(
                 "trainer": str,
                 "dataset": str | None,
                 "student_obs": tuple[int, ...] | None,
+                "spread": str | None,
                 "resume": Path | None,
             },
         ),
