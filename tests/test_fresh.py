@@ -86,10 +86,10 @@ def test_a_steep_law_is_held_to_labels_too():
     states[:50] = random.standard_normal((50, 3))
 
     def stiff(rows):
-        return np.clip(-10 * rows[:, :1] - 5 * rows[:, 1:2], -2, 2)
+        return np.clip(-30 * rows[:, :1] - 15 * rows[:, 1:2], -2, 2)
 
     found = {}
-    for name, law in {"stiff": stiff, "soft": lambda rows: 0.1 * stiff(rows / 30)}.items():
+    for name, law in {"stiff": stiff, "soft": lambda rows: stiff(rows / 100)}.items():
         expert = fdtasil.load_expert(law, 3, 1)
         ladder = calibrate(expert, states, measure_scales(states), np.random.default_rng(0), 0.3)
         source = Probes.parse("10,whitened,per_step=1")
