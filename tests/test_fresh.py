@@ -82,14 +82,14 @@ def test_an_expert_of_steps_is_not_asked_where_it_says_nothing():
 def test_a_steep_law_is_held_to_labels_too():
     """A swing-up that ends at rest: most states lie near it, and their deviation is large."""
     random = np.random.default_rng(0)
-    states = (0.02 * random.standard_normal((500, 3))).astype(np.float32)
+    states = (0.002 * random.standard_normal((500, 3))).astype(np.float32)
     states[:50] = random.standard_normal((50, 3))
 
     def stiff(rows):
-        return np.clip(-30 * rows[:, :1] - 15 * rows[:, 1:2], -2, 2)
+        return np.clip(-100 * rows[:, :1] - 50 * rows[:, 1:2], -2, 2)
 
     found = {}
-    for name, law in {"stiff": stiff, "soft": lambda rows: stiff(rows / 100)}.items():
+    for name, law in {"stiff": stiff, "soft": lambda rows: stiff(rows / 1000)}.items():
         expert = fdtasil.load_expert(law, 3, 1)
         ladder = calibrate(expert, states, measure_scales(states), np.random.default_rng(0), 0.3)
         source = Probes.parse("10,whitened,per_step=1")
