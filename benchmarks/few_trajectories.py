@@ -28,11 +28,11 @@ METHODS: dict[str, dict[str, Any]] = {
     "10 probes, noise": {"probes": 10, "trainer": "noise"},
     "10 probes, both": {"probes": "10,both"},
     "fresh": {"probes": "fresh"},
-    "fresh labels": {"probes": "fresh,labels"},
+    "fresh, both": {"probes": "fresh,both"},
     "fresh, noise": {"probes": "fresh", "trainer": "noise"},
 }
 PAIRS = (
-    ("fresh", "fresh labels"),
+    ("fresh", "fresh, both"),
     ("fresh", "10 probes"),
     ("fresh", "noise"),
     ("fresh", "fresh, noise"),

@@ -44,7 +44,7 @@ def test_no_query_is_asked_twice_and_all_are_as_predicted():
     assert result.queries["probe"] == 4 * 400  # forty states, ten visits a sample
     rows = np.concatenate(asked)
     assert len(np.unique(rows[-1600 - 40 : -40], axis=0)) > 1500
-    assert result.report["radius"] == [0.05, 2.0]
+    assert result.report["radius"] == [0.2, 2.0]
 
 
 @pytest.mark.parametrize("trainer", ["dagger", "dart"])
@@ -55,7 +55,7 @@ def test_every_trainer_and_order_asks_anew(trainer, order):
     assert result.queries == result.report["predicted_queries"]
     last = result.history[-1]
     assert last["moved_error"] > 0
-    assert last["derivative_error"] > 0
+    assert (last["derivative_error"] > 0) == (order == 2)
     assert (last["curvature_error"] > 0) == (order == 2)
 
 
@@ -66,15 +66,15 @@ def test_an_expert_of_steps_is_not_asked_where_it_says_nothing():
     found = {}
     for name, answer in {
         "smooth": linear,
-        "noisy": lambda rows: linear(rows) + 0.05 * random.standard_normal((len(rows), 2)),
+        "noisy": lambda rows: linear(rows) + 0.1 * random.standard_normal((len(rows), 2)),
         "steps": lambda rows: np.sign(linear(rows)),
     }.items():
         expert = fdtasil.load_expert(answer, 5, 2)
         ladder = calibrate(expert, states, scales, np.random.default_rng(0), 0.3)
         found[name] = ladder.complete(source).radius
-    assert found["smooth"] == (0.05, 2.0)
+    assert found["smooth"] == (0.2, 2.0)
     assert found["steps"] == (0.5, 2.0)
-    assert 0.05 < found["noisy"][0] <= 1
+    assert 0.2 < found["noisy"][0] <= 1
     assert found["noisy"][1] == 2.0
 
 

@@ -121,10 +121,11 @@ def test_short_specs():
     assert Probes.parse(10) == Probes.parse("10") == Probes.parse("adaptive:10")
     assert Probes.parse("10,central") == Probes.parse("adaptive:10,central")
     assert Probes.parse("sphere") == Probes.parse("sphere:10")
-    assert Probes.parse("fresh") == Probes.parse("10,both,resample,radius=wide")
-    assert Probes.parse("fresh:3,differences") == Probes.parse(
-        "3,differences,resample,radius=wide"
-    )
+    assert Probes.parse("fresh") == Probes.parse("10,resample,radius=wide")
+    few = Probes.parse("fresh:3,differences")
+    assert few == Probes.parse("3,differences,resample,radius=wide")
+    matches = [Probes.parse("fresh").with_order(order).match for order in (1, 2)]
+    assert matches == ["labels", "both"]
 
 
 @pytest.mark.fault(84, 86)

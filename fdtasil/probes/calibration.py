@@ -56,7 +56,7 @@ _ROUGH_RADIUS = 0.5
 _STEEP = 1.5
 _NOISY_FROM = 4.0**-6  # smallest radius with a derivative; float32 rounding stays below it
 _NOISY_SHARE = 0.3  # of noise in a difference; above it a given radius is warned of
-WIDE = (0.05, 2.0)
+WIDE = (0.2, 2.0)
 """The nearest and the farthest of the radii that teach well together, if an expert allows it."""
 _FAR = 4.0  # standard deviations beyond which no demonstrated state lies, and none was asked about
 

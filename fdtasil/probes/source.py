@@ -42,8 +42,8 @@ class Probes:
             leaves it to the calibration, or is forward for first order and central for second.
         radius: How far. Whitened space: standard deviations moved by each coordinate that moves
             (root mean square). Raw space: Euclidean length of the displacement. Two numbers:
-            each direction has a length of its own between them, log-uniform. "wide": from as near
-            as the expert allows, 0.05, to 2. None leaves it to the calibration, or to the preset.
+            each direction has a length of its own between them, log-uniform. "wide": from 0.2, or
+            as near as the expert allows, to 2. None leaves it to the calibration, or the preset.
         space: "whitened" scales each coordinate by its standard deviation over the
             demonstrations and freezes those that do not move; "raw" takes observations as they
             are. None leaves it to the preset.
@@ -52,7 +52,8 @@ class Probes:
         per_step: How many of a state's probes one visit of the state uses, or "all" (the cost of
             a training step then grows with their number). None leaves it to the preset.
         match: "differences" between moved and demonstrated states; "labels", the answers at the
-            moved states as they are (data augmentation); or "both". None leaves it to the
+            moved states as they are (data augmentation); or "both". None is the labels where there
+            are many distances (both for a loss of second order); else it leaves it to the
             calibration, or is the differences.
 
     Example:
@@ -111,8 +112,8 @@ class Probes:
                 `design[:count][,option...]`: designs adaptive (a mere number is one), basis,
                 sphere, orthogonal, jacobian, fresh; options forward, central, differences,
                 labels, both, resample, whitened, raw, radius=R, radius=LOW..HIGH, radius=wide,
-                per_step=K. "fresh" is "adaptive:10,both,resample,radius=wide". A `Probes` is
-                returned as it is.
+                per_step=K. "fresh" is "adaptive:10,resample,radius=wide". A `Probes` is returned
+                as it is.
 
         Returns:
             The source, or None for plain behaviour cloning.
@@ -169,10 +170,14 @@ class Probes:
         Raises:
             SettingError: If the stencil that was asked for has none of second order.
         """
-        if self.has_labels:
+        match = self.match
+        if match is None and isinstance(self.radius, str | tuple):
+            # Differences of near probes would outweigh the far ones, which teach to come back.
+            match = "labels" if order == 1 else "both"
+        if match in ("labels", "both"):
             usual = FORWARD  # a label needs no other side
         stencil = self.stencil or (CENTRAL if order == 2 else usual)
-        if order == 2 and self.match == "labels":
+        if order == 2 and match == "labels":
             raise SettingError(
                 "order=2 with labels",
                 "second differences to match",
@@ -184,7 +189,7 @@ class Probes:
                 "a stencil with second differences",
                 'write probes="sphere:10,central"',
             )
-        return replace(self, stencil=stencil)
+        return replace(self, stencil=stencil, match=match)
 
     def queries(self, states: int, dimension: int, visits: int) -> int:
         """Return the rows that the expert is asked for, at most where the stencil is open.
@@ -250,7 +255,7 @@ def _shortest(number: float) -> str:
 
 FRESH = "fresh"
 """What asks anew, at many distances, as long as it trains."""
-_FRESH = {"match": "both", "resample": True, "radius": "wide"}
+_FRESH = {"resample": True, "radius": "wide"}
 
 _GRAMMAR = 'a number of probes, or a text like "sphere:10,resample", "basis,central", "jacobian"'
 _EXAMPLES = "write for example probes=10, or probes=0 for plain behaviour cloning"

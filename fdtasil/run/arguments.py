@@ -77,11 +77,9 @@ class Arguments:
             EnvironmentFault: If it fails in its first steps.
         """
         usual = self._usual(subject)
-        if self.anew is None:
+        if self.anew is None or subject.expert is None:
             return usual
-        work, n = None, usual.observation_size
-        if subject.expert is not None:
-            work = multiply_adds(subject.expert, n)
+        work = multiply_adds(subject.expert, usual.observation_size)
         if work is None:
             return replace(usual, reason="asked once: what a query costs is not known")
         if work > CHEAP:
