@@ -129,7 +129,8 @@ def test_what_is_cheap_follows_from_kind_and_size(expert, tmp_path):
             continue
         assert least <= found <= least + 10_000, name
         assert (found <= CHEAP) == cheap, name
-    assert multiply_adds(fdtasil.load_expert(expert, 5, workers=2, threads=True), 5) is None
+    for how in ({"workers": 2, "threads": True}, {"batch": 1}):
+        assert multiply_adds(fdtasil.load_expert(expert, 5, **how), 5) is None
 
 
 @pytest.mark.parametrize(

@@ -18,6 +18,7 @@ __all__ = ["CHEAP", "multiply_adds", "stored_numbers"]
 CHEAP = 2**20
 """Multiply-adds a row up to which a million queries take less than a minute of one core."""
 
+_FEW = 64  # rows at once, below which the calls take longer than the rows
 _MANY = 500  # operations: each takes microseconds, whatever it computes
 
 # Operators that use each number of the file at most once for a row: those of an MLP, and others.
@@ -56,14 +57,14 @@ def multiply_adds(expert: Expert, observation_size: int) -> int | None:
         observation_size: n.
 
     Returns:
-        The number, or None where kind and size do not say it: functions, servers, workers, and
-        networks with loops or memory.
+        The number, or None where kind and size do not say it: functions, servers, workers, experts
+        that are asked about few rows at once, and networks with loops or memory.
 
     Example:
         >>> multiply_adds(Expert(lambda rows: rows, "a function"), 3) is None
         True
     """
-    if expert.workers is not None:
+    if expert.workers is not None or expert.chunk < _FEW:
         return None
     if expert.multiply_adds is not None or expert.module is None:
         return expert.multiply_adds

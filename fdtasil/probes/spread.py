@@ -59,7 +59,7 @@ class Spread:
                 for key, value in given.items()
             }
             return cls(dict(sorted(read.items())))
-        if given != "bounds":
+        if not isinstance(given, str):
             raise SettingError(spelt("spread", given), _EXPECTED, _EXAMPLE)
         if (
             low is None
