@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import GAIN, QUICK, TOY, mlp_onnx
+from onnx import TensorProto
 from toy_environments import Integrator
 
 import fdtasil
@@ -116,7 +117,8 @@ def test_what_is_cheap_follows_from_kind_and_size(expert, tmp_path):
 
     experts = {
         "onnx": (expert, 5 * 16 + 16 * 16 + 16 * 2, True),
-        "quantised": (mlp_onnx(tmp_path / "odd.onnx", reshape_to=[-1, 5]), 5 * 8 + 8 * 2, True),
+        "reshaped": (mlp_onnx(tmp_path / "odd.onnx", reshape_to=[-1, 5]), None, None),
+        "double": (mlp_onnx(tmp_path / "d.onnx", kind=TensorProto.DOUBLE), 5 * 8 + 8 * 2, True),
         "module": (narrow, 10, True),
         "wide": (wide, 2**20, False),
         "planner": (Planner(), None, None),
@@ -214,7 +216,8 @@ COMMANDED = {
 @pytest.mark.parametrize("spread", [{4: 0.58}, "4:0.58", "bounds"])
 def test_one_demonstration_teaches_every_command(spread):
     result = fdtasil.distill(follows, Commanded, "fresh", spread=spread, **COMMANDED)
-    assert result.settings["spread"] == {"4": pytest.approx(0.58, abs=0.01)}
+    said = result.settings["spread"]
+    assert (said["bounds"] if spread == "bounds" else said) == {"4": pytest.approx(0.58, abs=0.01)}
     assert not result.report["warnings"]
     assert result.evaluation.normalized_return > 0.9
 
@@ -240,7 +243,8 @@ def test_what_was_told_of_is_moved_alone_too():
 
 
 @pytest.mark.parametrize(
-    "spread", ["far", "1:2:3", "4:", {5: 1.0}, {"command": 1.0}, {0: 0.0}, {0: "a"}, [0.5], 3]
+    "spread",
+    ["far", "1:2:3", "1:2,1:3", "4:", {5: 1.0}, {"command": 1.0}, {0: 0.0}, {0: "a"}, [0.5], 3],
 )
 def test_a_wrong_spread_is_refused(spread):
     with pytest.raises(SettingError, match="next step"):
@@ -296,3 +300,82 @@ def test_nothing_is_recorded_anew_of_a_given_dataset(expert):
         fdtasil.distill(linear, TOY, dataset=given, keep="survivors")
     with pytest.raises(SettingError, match="keep="):
         fdtasil.distill(linear, TOY, keep="best", **QUICK)
+
+
+# --- what a review found
+
+
+def test_a_budget_that_is_another_does_not_change_what_is_asked(expert, tmp_path):
+    """Begun with ten stored probes for want of queries, and gone on with so."""
+    from test_resume import Stop, stop_at
+
+    run = {**QUICK, "fit": Fit(steps=300)}
+    with pytest.raises(Stop):
+        fdtasil.distill(expert, TOY, out=tmp_path, callback=stop_at(1), max_queries=2500, **run)
+    result = fdtasil.distill(expert, TOY, resume=tmp_path, **run)
+    assert result.report["probes"].startswith("adaptive:10,forward,whitened")
+    assert result.student.architecture == run["student"]
+
+
+def test_short_episodes_do_not_ask_more_than_what_was_allowed(expert, tmp_path):
+    """Fewer states are visited more often: what is chosen is held to the most that may be due."""
+    run = {**QUICK, "episodes": 1, "horizon": 40, "fit": Fit(steps=200, batch_size=30)}
+    full = fdtasil.distill(expert, TOY, **run)
+    assert full.report["probes"].startswith("adaptive:10,forward,labels,resample")
+    predicted = sum(full.report["predicted_queries"].values())
+    held = fdtasil.distill(expert, TOY, max_queries=predicted, **run)
+    assert "resample" not in held.report["probes"]
+
+
+def test_answers_of_fresh_probes_are_used_as_they_are_if_so_is_asked_for(expert):
+    first = fdtasil.distill(expert, TOY, "fresh", **QUICK)
+    again = fdtasil.distill(dataset=first.dataset, probes="fresh", fit=QUICK["fit"])
+    assert again.report["probes"] == first.report["probes"].replace(",resample", "")
+
+
+def test_no_told_coordinate_is_moved_by_next_to_nothing():
+    """Beside large values float32 would round such a step away, and the run would end."""
+    states = np.random.default_rng(0).standard_normal((300, 5)).astype(np.float32)
+    states[:, 4] = 1000
+    scales = measure_scales(states).spread_by({4: 0.5})
+    source = Probes.parse("fresh,radius=0.2..2,whitened").with_order(1)
+    around = Surroundings.of(states, source, scales)
+    for sample in range(60):
+        drawn = around.sample(np.random.default_rng(sample)).displacements
+        told = drawn[(drawn[:, :4] == 0).all(axis=1), 4]
+        assert np.abs(told).min() > 0.09
+
+
+def test_a_function_of_the_observation_keeps_its_own_scale():
+    """A view of as many coordinates is not the observation itself."""
+    run = {**QUICK, "student_obs": lambda rows: rows[:, ::-1] * 0.01, "probes": "3,forward"}
+    told = fdtasil.distill(linear, TOY, spread={0: 50.0}, **run).student
+    assert np.array_equal(told.scale, fdtasil.distill(linear, TOY, **run).student.scale)
+
+
+@pytest.mark.parametrize("source", ["10,raw", "stored"])
+def test_deviations_that_no_probe_is_moved_by_are_refused(source):
+    stored = source == "stored"
+    given = fdtasil.distill(linear, TOY, 3, **QUICK).dataset if stored else None
+    shape = {name: QUICK[name] for name in ("fit", "student", "evaluation_episodes")}
+    with pytest.raises(SettingError, match="spread= with"):
+        fdtasil.distill(
+            linear,
+            TOY,
+            None if stored else source,
+            spread={0: 1.0},
+            dataset=given,
+            **(shape if stored else QUICK),
+        )
+
+
+@pytest.mark.parametrize(
+    ("spec", "match"),
+    [
+        ("jacobian,radius=0.1..1", None),
+        ("10,radius=0.3..0.3", None),
+        ("10,radius=0.1..1", "labels"),
+    ],
+)
+def test_many_distances_alone_make_labels(spec, match):
+    assert Probes.parse(spec).with_order(1).match == match

@@ -27,26 +27,21 @@ _ONCE = OPERATORS.keys() | {
     "BatchNormalization",
     "DequantizeLinear",
     "DynamicQuantizeLinear",
-    "Gather",
     "LayerNormalization",
     "MatMulInteger",
     "Pow",
     "QGemm",
     "QLinearMatMul",
     "QuantizeLinear",
-    "ReduceMean",
-    "ReduceSum",
-    "Reshape",
     "Softmax",
-    "Split",
-    "Squeeze",
-    "Transpose",
     "TreeEnsemble",
     "TreeEnsembleClassifier",
     "TreeEnsembleRegressor",
-    "Unsqueeze",
     "Where",
 }
+_RIGHT = {"QLinearMatMul": 3, "QGemm": 3}
+_PRODUCTS = {"Gemm", "MatMul", "MatMulInteger", *_RIGHT}
+"""Operators that multiply matrices, and which input is the right one, if it is not the second."""
 
 
 def multiply_adds(expert: Expert, observation_size: int) -> int | None:
@@ -76,11 +71,28 @@ def stored_numbers(model: "onnx.ModelProto") -> int | None:
     nodes = model.graph.node
     if model.functions or len(nodes) > _MANY or not {n.op_type for n in nodes} <= _ONCE:
         return None
+    if any(n.op_type in _PRODUCTS and not _is_of_weights(n, model) for n in nodes):
+        return None
     held = sum(_product(tensor.dims) for tensor in model.graph.initializer)
     for node in nodes:
         for entry in node.attribute:
             held += max(len(entry.floats), len(entry.ints), _product(entry.t.dims))
     return held
+
+
+def _is_of_weights(node: "onnx.NodeProto", model: "onnx.ModelProto") -> bool:
+    """Whether a product has a matrix of the file on its right: a row then meets each number once.
+
+    Of a quantised network that matrix comes out of a node that has numbers of the file alone.
+    """
+    held = {tensor.name: len(tensor.dims) for tensor in model.graph.initializer}
+    for other in model.graph.node:
+        if other.op_type == "DequantizeLinear" and set(other.input) <= held.keys():
+            held[other.output[0]] = held[other.input[0]]
+        if other.op_type == "Constant":
+            held[other.output[0]] = len(other.attribute[0].t.dims)
+    right = node.input[_RIGHT.get(node.op_type, 1)]
+    return held.get(right) == 2
 
 
 def _product(sizes: Iterable[int]) -> int:

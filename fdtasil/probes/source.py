@@ -150,6 +150,13 @@ class Probes:
         return self.stencil is not None and self.stencil.exact
 
     @property
+    def is_ranged(self) -> bool:
+        """Whether each direction has a distance of its own."""
+        return self.radius == "wide" or (
+            isinstance(self.radius, tuple) and self.radius[0] != self.radius[1]
+        )
+
+    @property
     def has_labels(self) -> bool:
         """Whether the answers at the moved states are matched as they are."""
         return self.match in ("labels", "both")
@@ -171,7 +178,7 @@ class Probes:
             SettingError: If the stencil that was asked for has none of second order.
         """
         match = self.match
-        if match is None and isinstance(self.radius, str | tuple):
+        if match is None and self.is_ranged and not self.exact:
             # Differences of near probes would outweigh the far ones, which teach to come back.
             match = "labels" if order == 1 else "both"
         if match in ("labels", "both"):

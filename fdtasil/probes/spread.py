@@ -17,7 +17,7 @@ deviations of uniform values in the bounds of the observations."""
 
 _STILL = 1e-3  # of what a coordinate varies between episodes, that it may vary within one
 _EXPECTED = 'a deviation for each coordinate, or "bounds"'
-_EXAMPLE = "write for example spread={3: 0.5}"
+_EXAMPLE = "write for example spread={0: 0.5}"
 
 
 @dataclass(frozen=True)
@@ -52,13 +52,7 @@ class Spread:
         if isinstance(given, str) and given != "bounds":
             given = _read(given)
         if isinstance(given, Mapping):
-            read = {
-                check_count("a coordinate of spread", key, 0, n - 1): check_number(
-                    f"spread of coordinate {key}", value, positive=True
-                )
-                for key, value in given.items()
-            }
-            return cls(dict(sorted(read.items())))
+            return cls(dict(sorted(_checked(key, value, n) for key, value in given.items())))
         if not isinstance(given, str):
             raise SettingError(spelt("spread", given), _EXPECTED, _EXAMPLE)
         if (
@@ -82,14 +76,28 @@ class Spread:
 
     def to_json(self) -> dict[str, Any] | None:
         """Return the deviations by coordinate as plain JSON values, or None without any."""
-        return {str(i): d for i, d in self.deviations.items()} or None
+        plain = {str(i): d for i, d in self.deviations.items()}
+        return ({"bounds": plain} if self.where_still else plain) or None
+
+
+def _checked(coordinate: object, deviation: object, n: int) -> tuple[int, float]:
+    try:
+        return (
+            check_count("coordinate", coordinate, 0, n - 1),
+            check_number("deviation", deviation, positive=True),
+        )
+    except SettingError as error:
+        raise SettingError(f"spread: {error.found}", error.expected, _EXAMPLE) from None
 
 
 def _read(text: str) -> dict[int, float]:
     """Read "3:0.5,7:0.1"."""
     try:
-        pairs = (part.split(":") for part in text.split(","))
-        return {int(coordinate): float(deviation) for coordinate, deviation in pairs}
+        pairs = [part.split(":") for part in text.split(",")]
+        read = {int(coordinate): float(deviation) for coordinate, deviation in pairs}
+        if len(read) < len(pairs):
+            raise ValueError("a coordinate twice")
+        return read
     except ValueError:
         raise SettingError(spelt("spread", text), _EXPECTED, _EXAMPLE) from None
 

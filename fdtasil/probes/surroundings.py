@@ -13,7 +13,7 @@ __all__ = ["Drawn", "Surroundings"]
 
 # States that a design is shown: enough to tell which displacements can occur.
 _SHOWN = 4096
-_APART = 0.25  # share of the directions that move what was told of alone, and as many the others
+_ALONE = 0.25  # share of the directions that move what was told of alone, and as many the others
 _ROUNDED = 0.1  # share of a step that rounding may take before it is warned of
 
 
@@ -57,13 +57,16 @@ class Surroundings:
     draw: Draw
 
     @classmethod
-    def of(cls, observations: np.ndarray, probes: Probes, scales: Scales) -> "Surroundings":
+    def of(
+        cls, observations: np.ndarray, probes: Probes, scales: Scales, *, again: bool = False
+    ) -> "Surroundings":
         """Return the surroundings of (N, n) states.
 
         Args:
             observations: The states.
             probes: The derivative source, with radius, space and stencil set.
             scales: Of the demonstrations.
+            again: Whether they were looked at before, and what there is to warn of was said.
 
         Raises:
             SettingError: If no coordinate moves, or a step is lost in rounding or beyond float32.
@@ -73,7 +76,8 @@ class Surroundings:
         deviation = np.ones(len(live)) if raw else scales.deviation[live]
         ends = (1.0, 1.0) if probes.exact else probes.reaches
         step = 1.0 if raw or probes.exact else usual
-        _check_steps(step / usual * ends[0] * deviation, observations[:, live], probes, live)
+        if not again:
+            _check_steps(step / usual * ends[0] * deviation, observations[:, live], probes, live)
         _check_ends(step * ends[1] * deviation, observations[:, live], probes)
         # Of one distance: states lie apart in its units. Of many: in units of one deviation.
         if ends[0] == ends[1]:
@@ -108,11 +112,18 @@ class Surroundings:
     def _take_apart(self, bank: np.ndarray, random: np.random.Generator) -> None:
         """Let a quarter of (P, d) directions move only what was told of, and a quarter not."""
         lot, normal = random.random(len(bank)), random.standard_normal(bank.shape, np.float32)
-        alone, rest = lot < _APART, (lot >= _APART) & (lot < 2 * _APART)
+        alone, rest = lot < _ALONE, (lot >= _ALONE) & (lot < 2 * _ALONE)
         # Drawn anew: directions between demonstrated states leave still what is still in them.
-        bank[alone] = np.where(self.told, normal[alone] / bank.shape[1] ** 0.5, 0)
+        bank[alone] = _kept(normal[alone], self.told)
         if not self.told.all():
-            bank[rest] *= ~self.told
+            bank[rest] = _kept(bank[rest], ~self.told)
+
+
+def _kept(directions: np.ndarray, moved: np.ndarray) -> np.ndarray:
+    """Return (P, d) directions along some coordinates, as long as isotropic ones are there."""
+    left = np.where(moved, directions, 0)
+    lengths = np.linalg.norm(left, axis=1, keepdims=True)
+    return left * (moved.mean() ** 0.5 / np.where(lengths > 0, lengths, 1))
 
 
 def _check_ends(sizes: np.ndarray, values: np.ndarray, probes: Probes) -> None:

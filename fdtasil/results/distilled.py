@@ -43,7 +43,7 @@ class Distilled:
         evaluation: Student against expert, from the same starts; None where there was no expert
             or no environment to compare them in.
         history: Training losses, one entry for each 100 steps: round, step, loss, action_error,
-            derivative_error, curvature_error, validation_loss.
+            derivative_error, curvature_error, moved_error, validation_loss.
         queries: Rows that the expert answered, by purpose: act, label, probe, check (the gate),
             evaluate.
         settings: The exact arguments and what they resolved to, with versions; plain JSON.

@@ -98,7 +98,7 @@ class Account:
             raise SettingError(
                 f"{asked:,} queries are asked, and {rows:,} more are due",
                 f"at most max_queries={most:,}",
-                "raise max_queries, or leave out resample",
+                "raise max_queries, or write probes=10, which are asked once",
             )
 
 

@@ -69,8 +69,12 @@ class Arguments:
     max_queries: int | None
     device: str
 
-    def configure(self, subject: Subject) -> Configuration:
+    def configure(self, subject: Subject, anew: bool | None = None) -> Configuration:
         """Return the configuration of a run with an expert and an environment.
+
+        Args:
+            subject: The two.
+            anew: Whether a run that goes on asks anew; None for one that begins.
 
         Raises:
             SettingError: If the environment allows no such horizon.
@@ -85,13 +89,14 @@ class Arguments:
         if work > CHEAP:
             return replace(usual, reason=f"asked once: {work:,} multiply-adds a query")
         student = self.student or usual_architecture(anew=True)
-        anew = replace(
+        fresh = replace(
             usual, probes=self.anew, calibrated=True, probes_given=False, student=student
         )
-        due = sum(anew.predicted_queries().values())
-        if self.max_queries is not None and due > self.max_queries:
+        due = fresh.most_queries()
+        allowed = self.max_queries is None or due <= self.max_queries
+        if not (allowed if anew is None else anew):
             return replace(usual, reason=f"asked once: {due:,} queries are more than max_queries")
-        return replace(anew, reason=f"asked anew all the time: {work:,} multiply-adds a query")
+        return replace(fresh, reason=f"asked anew all the time: {work:,} multiply-adds a query")
 
     def _usual(self, subject: Subject) -> Configuration:
         given, source, expert = self.given, self.probes, subject.expert
@@ -232,7 +237,7 @@ def _source_of(
         return asked.with_order(order, None if left_open else FORWARD)
     asked = replace(  # what was left open was found by a calibration, and is stored
         asked,
-        radius=asked.radius or stored.radius,
+        radius=stored.radius if asked.radius in (None, "wide") else asked.radius,
         stencil=asked.stencil or stored.stencil,
         match=asked.match or stored.match,
     ).with_order(order)

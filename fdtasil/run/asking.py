@@ -46,15 +46,17 @@ class Asking:
         if found is not None and self.calibration is None and self._run.probes is not None:
             self.calibration, self.source = found, found.complete(self._run.probes)
 
-    def around(self, observations: np.ndarray, scales: Scales) -> Surroundings:
-        """Return where the source probes around (N, n) states.
+    def around(
+        self, observations: np.ndarray, scales: Scales, *, again: bool = False
+    ) -> Surroundings:
+        """Return where the source probes around (N, n) states; see `Surroundings.of`.
 
         Raises:
             SettingError: If there is nobody to ask, or as `Surroundings.of`.
         """
         assert self.source is not None, "plain behaviour cloning asks no probes"
         self._askable()
-        return Surroundings.of(observations, self.source, scales)
+        return Surroundings.of(observations, self.source, scales, again=again)
 
     def ask(
         self, around: Surroundings, *stream: int, beginning: Beginning = FROM_THE_START

@@ -2,7 +2,6 @@
 
 from collections import Counter
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
@@ -65,11 +64,15 @@ class Collecting:
         first = before.episodes if before else 0
         behaviour = self._behaviour(round_, student)
         episodes = self._episodes(behaviour, "rollout", first, count)
-        if round_ == 0:  # every trainer's expert acts alone there
+        if round_ == 0:  # every trainer's expert acts there
             check_episodes(episodes, self.pool.name)
         replaced = 0
         if round_ == 0 and self.keep == SURVIVORS:
-            further = partial(self._episodes, behaviour, "survivors")
+
+            def further(first: int, count: int) -> Episodes:
+                # One that begins anew: what it does in its first episode is done again.
+                return self._episodes(self._behaviour(0, None), "survivors", first, count)
+
             episodes, replaced = survivors(episodes, further, self.pool.name)
         states = label(episodes, self.expert, first, round_)
         boxes, counts = self.pool.boxes, Counter(before.counts if before else {})

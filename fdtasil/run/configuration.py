@@ -101,6 +101,31 @@ class Configuration:
             found["evaluate"] = 2 * self.evaluation_episodes * self.horizon
         return found
 
+    def most_queries(self) -> int:
+        """Return the rows that are asked for at most, however short episodes are.
+
+        Of fewer states a source that resamples asks more samples, each of them smaller; the last
+        is used in part.
+        """
+        predicted = self.predicted_queries()
+        if self.probes is None or not self.probes.resample:
+            return sum(predicted.values())
+        schedule, total, episodes = self.fit.schedule(anew=True), 0, 0
+        once = self.probes.queries(1, self.observation_size, visits=1)
+        count = self.probes.directions.count(self.observation_size)
+        for new in self.rounds:
+            episodes += new
+            states = round(episodes * self._length)
+            visited = schedule.total_steps(states) * schedule.batch_size + states
+            used = visited * self.probes.used_per_visit(count) // count
+            total += once * (used + 2 * states)
+        return sum(predicted.values()) - predicted["probe"] + max(total, predicted["probe"])
+
+    @property
+    def _length(self) -> float:
+        """Steps of an episode: the horizon, or the mean of those given."""
+        return self.horizon if self.states is None else self.states / self.episodes
+
     @property
     def largest_batch(self) -> int:
         """Rows of the large batch that the gate asks, 0 for none."""
@@ -126,6 +151,26 @@ class Configuration:
     def ladder(self) -> Ladder:
         """The radii that a calibration asks at."""
         return ladder_for(self._predicted_probes(self.probes) if self.probes else 0)
+
+    @property
+    def can_spread(self) -> bool:
+        """Whether probes are asked in units of deviations, which may be said to be others."""
+        asked = self.probes is not None and not self.probes_given
+        return asked and self.probes is not None and self.probes.space == "whitened"
+
+    def check_spread(self) -> None:
+        """Refuse deviations that no probe is moved by; plain cloning normalises by them.
+
+        Raises:
+            SettingError: If there are some.
+        """
+        if self.spread.deviations and self.probes is not None and not self.can_spread:
+            how = "answers that are stored" if self.probes_given else "raw probes"
+            raise SettingError(
+                f"spread= with {how}",
+                "probes in units of deviations, which are asked in this run",
+                "leave spread= out, or the dataset's answers (probes=0), or raw",
+            )
 
     def check_budget(self) -> None:
         """Refuse a run that may ask more than it is allowed to.
@@ -163,7 +208,7 @@ class Configuration:
         New states are asked about once; a source that resamples asks about all states again, for
         every sample but the first of every round.
         """
-        length = self.horizon if self.states is None else self.states / self.episodes
+        length = self._length
         collected, episodes, total = 0, 0, 0
         for count in self.rounds:
             new = round(count * length)

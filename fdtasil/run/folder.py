@@ -8,7 +8,7 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
-from fdtasil.errors import SettingError, StorageError, warn
+from fdtasil.errors import FdtasilError, SettingError, StorageError, warn
 from fdtasil.files.lock import locked
 from fdtasil.files.names import check_no_links, inside
 from fdtasil.files.reading import read_plain
@@ -167,6 +167,15 @@ class RunFolder:
 def _drop(folder: Path) -> None:
     with suppress(StorageError):  # it is of no use any more, and does no harm
         remove_folder(folder)
+
+
+def asked_anew(path: Path) -> bool | None:
+    """Return whether the run that was begun in a folder asks anew; None if that can't be read."""
+    try:
+        probes = _read_config(path)["probes"]
+    except (FdtasilError, KeyError):
+        return None  # which is said when the folder is opened
+    return isinstance(probes, str) and "resample" in probes.split(",")
 
 
 def _read_config(path: Path) -> dict[str, Any]:

@@ -56,15 +56,16 @@ class Lesson:
     def normaliser(self, seen: np.ndarray) -> Scales:
         """Return the scales of (N, k) observations as the student sees them."""
         own, columns = measure_scales(seen), self.view.columns
-        told = np.flatnonzero(self.scales.told).tolist()
-        if columns is None and self.view.size != len(self.scales.told):
+        if self.view.is_whole:
+            columns = tuple(range(self.view.size))
+        if columns is None:
             return own  # of a function of the observation: its values alone tell
-        mine = {
-            columns.index(i) if columns else i: float(self.scales.deviation[i])
-            for i in told
-            if columns is None or i in columns
+        told = {
+            place: float(self.scales.deviation[column])
+            for place, column in enumerate(columns)
+            if self.scales.told[column]
         }
-        return own.spread_by(mine)
+        return own.spread_by(told)
 
     @property
     def dataset(self) -> Dataset:

@@ -28,7 +28,7 @@ from fdtasil.run.checkpoints import Checkpoints
 from fdtasil.run.collecting import Collecting
 from fdtasil.run.configuration import Configuration
 from fdtasil.run.events import Callback, Event, tell_all
-from fdtasil.run.folder import open_run_folder
+from fdtasil.run.folder import asked_anew, open_run_folder
 from fdtasil.run.interrupts import heard_interrupts
 from fdtasil.run.lesson import Lesson
 from fdtasil.run.report import config_of, report_of
@@ -82,14 +82,16 @@ def distill(
             None with `dataset`: then nobody is asked.
         env: A gymnasium id (`module:Id` too), a gymnasium environment, or a function making one.
             None with `dataset`: then nothing is recorded or evaluated.
-        probes: The derivative source. Left out, 10, or what `dataset` holds. 0 (plain behaviour
-            cloning), N (N random directions at each state; half of them lead towards other
-            visited states where few of all observations can occur), "sphere:N" (N isotropic
-            directions at each state, asked once), "sphere:N,resample" (asked anew while
-            training), "orthogonal:N", "basis", "jacobian" (the analytic reference). Options after
-            commas: forward, central, labels (the answers are labels of the moved states, and
-            nothing is differenced), radius=R, raw, whitened, per_step=K. Radius and stencil that
-            are left open are found by asking at a ladder of radii first.
+        probes: The derivative source. Left out, what `dataset` holds, or "fresh" for files,
+            modules and agents of few multiply-adds, and 10 for others. 0 (plain behaviour
+            cloning), "fresh" (asked anew at every visit, near and far; the answers are labels),
+            N (N random directions at each state; half of them lead towards other visited states
+            where few of all observations can occur), "sphere:N" (N isotropic directions at each
+            state, asked once), "sphere:N,resample" (new ones when each was used), "orthogonal:N",
+            "basis", "jacobian" (the analytic reference). Options after commas: forward, central,
+            differences, labels (of the moved states), both, radius=R, radius=LOW..HIGH (one for
+            each direction), raw, whitened, per_step=K. What is left open of radius and stencil is
+            found by asking at a ladder of radii first.
         trainer: Who acts in which round: "bc" (the expert), "dagger" (a mixture of expert and
             student), "dart" (the expert with noise as large as the student's errors), "noise" (the
             expert with noise in every second episode), or a trainer with settings of its own.
@@ -111,9 +113,11 @@ def distill(
         preset: Where defaults of probes and fit come from: "standard", or "paper" (TaSIL's
             settings: raw probes of radius 0.01, weight 0.01, 4,500 epochs).
         dataset: Train from this instead of recording: a run folder, its demonstrations.npz, or a
-            `Dataset`. Stored answers to probes are used as they are.
+            `Dataset`. Stored answers to probes are used as they are, but where they are those of
+            "fresh" and a cheap expert can be asked anew.
         evaluation_episodes: Episodes of the paired evaluation; 0 leaves it out.
-        max_queries: Refuse to start a run that may ask the expert more often.
+        max_queries: Refuse to start a run that may ask the expert more often; where `probes` are
+            left out, they are those that it allows.
         device: Where the student is trained: "cpu", "cuda", "cuda:N".
         force: Go on with a warning where the expert fails the gate but answers.
         out: Folder of the run: checkpoints while it goes on, then all its files. It is missing,
@@ -169,7 +173,9 @@ def distill(
     )
     chosen, told = pick_device(arguments.device), tell_all(callback)
     with heard_warnings() as notes, open_subject(expert, env, given) as subject:
-        run, bars = arguments.configure(subject), Progress(progress)
+        going_on = asked_anew(folder) if folder is not None and resume is not None else None
+        run, bars = arguments.configure(subject, going_on), Progress(progress)
+        run.check_spread()
         run.check_budget()
         with (
             open_run_folder(folder, config_of(run), resume=resume is not None) as kept,

@@ -71,7 +71,7 @@ PRESETS = {
         calibrated=False,
         space="raw",
         per_step="all",
-        fit=Fit(epochs=4500, epsilon=1e-4, weight=0.01, curvature_weight=0.01),
+        fit=Fit(epochs=4500, learning_rate=1e-3, epsilon=1e-4, weight=0.01, curvature_weight=0.01),
     ),
 }
 

@@ -68,9 +68,9 @@ class Rounds:
             policy = lesson.view.policy(trained.student.act) if lesson and trained else None
             lesson = self._learnt_from(round_, count, collected, lesson, policy)
             collected = lesson.collected
-            if round_ == 0 and expert is not None:
+            if round_ == 0 and expert is not None and self.collecting is not None:
                 warn_of_falls(collected.dataset.demonstrations, expert, self.run.keep)
-            if round_ == len(self.run.rounds) - 1 and expert is not None:
+            if round_ == len(self.run.rounds) - 1 and expert is not None and self.run.can_spread:
                 warn_of_still_coordinates(lesson, expert)
             trained = self._trained(round_, lesson, trained)
             last = trained.history[-1]

@@ -36,7 +36,7 @@ class Samples:
     @cached_property
     def around(self) -> Surroundings:
         """Where the source probes; the same for all samples."""
-        return self.asking.around(self.observations, self.lesson.scales)
+        return self.asking.around(self.observations, self.lesson.scales, again=True)
 
     @property
     def observations(self) -> np.ndarray:

@@ -64,7 +64,7 @@ class TaylorLoss(NamedTuple):
         loss: (), what is minimised.
         action_error: (), mean norm of the action error, in units of the actions.
         derivative_error: (), mean norm of the error of the first differences, in units of the
-            whitened Jacobian's Frobenius norm; 0 without probes.
+            whitened Jacobian's Frobenius norm; 0 where none are matched.
         curvature_error: (), mean norm of the error of the second differences, in units of z'Hz
             for standard normal z in whitened coordinates; 0 in a loss of first order.
         moved_error: (), mean norm of the action error at the moved states, in units of the

@@ -96,6 +96,11 @@ class View:
         seen = np.isin(np.arange(n), columns)
         return View(_Columns(columns), columns, len(columns), seen)
 
+    @property
+    def is_whole(self) -> bool:
+        """Whether it is the observation itself."""
+        return self.look is _whole
+
     def __reduce__(self) -> tuple[object, ...]:
         """Leave out a function that can't be pickled, such as a lambda: the rest is not lost."""
         look = self.look
