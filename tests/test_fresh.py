@@ -313,7 +313,7 @@ def test_a_budget_that_is_another_does_not_change_what_is_asked(expert, tmp_path
     with pytest.raises(Stop):
         fdtasil.distill(expert, TOY, out=tmp_path, callback=stop_at(1), max_queries=2500, **run)
     result = fdtasil.distill(expert, TOY, resume=tmp_path, **run)
-    assert result.report["probes"].startswith("adaptive:10,forward,whitened")
+    assert result.report["probes"].startswith("adaptive:10,forward,differences,whitened")
     assert result.student.architecture == run["student"]
 
 
