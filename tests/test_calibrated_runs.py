@@ -28,7 +28,7 @@ def pseudonoise(observations):
 
 
 @pytest.mark.parametrize(
-    ("regime", "stencil", "radius"), [("smooth", "forward", 0.3), ("steps", "central", 0.5)]
+    ("regime", "stencil", "radius"), [("smooth", "forward", 0.3), ("steps", "central,both", 0.5)]
 )
 def test_an_open_source_is_completed(regime, stencil, radius):
     result = fdtasil.distill(EXPERTS[regime], TOY, 3, **QUICK)

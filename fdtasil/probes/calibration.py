@@ -77,7 +77,7 @@ class Calibration:
             radius, where nothing but rounding and noise is left of them.
         radius: Suggested, in standard deviations of each coordinate.
         stencil: Suggested, "forward" or "central".
-        match: Suggested, "differences" or "both".
+        match: Suggested where the law is steep, "both"; else None.
         similarity: Secant similarity at each radius and a quarter of it; the first is NaN.
         change: Root mean square change of an action at each radius.
         radii: The radii, ascending.
@@ -92,7 +92,7 @@ class Calibration:
     change: tuple[float, ...]
     radii: tuple[float, ...]
     queries: int
-    match: Match = "differences"  # of calibrations that are older than the others
+    match: Match | None = None
 
     def complete(self, probes: Probes) -> Probes:
         """Return the source with what it leaves open filled in; warn of a radius that misleads."""
@@ -195,7 +195,7 @@ def calibrate(
         tuple(change.tolist()),
         tuple(radii.tolist()),
         ladder.queries,
-        "both" if steep else "differences",
+        "both" if steep else None,
     )
 
 

@@ -17,6 +17,7 @@ from fdtasil.files.storage import (
     explain,
     is_written,
     remove_folder,
+    remove_if_empty,
     verify,
     write_bytes,
     write_folder,
@@ -132,7 +133,11 @@ class RunFolder:
         # not before there is something to go on from.
         config = inside(self._path, f"{CHECKPOINTS}/{CONFIG}")
         if not config.exists():
-            write_bytes(config, stamped(self._config))
+            try:
+                write_bytes(config, stamped(self._config))
+            except BaseException:
+                remove_if_empty(config.parent)  # without it nobody could tell whose it is
+                raise
         name = f"{CHECKPOINTS}/{round_}/{stage}-{number}"
         write_folder(inside(self._path, name), files())
         for older in _numbered(self._path, round_, stage):

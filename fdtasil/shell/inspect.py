@@ -66,7 +66,7 @@ def command(
             ("regime", found.regime),
             ("noise floor", f"{found.noise_floor:.1e} of the action, root mean square"),
             ("suggested radius", f"{found.radius:.2g} deviations, {found.stencil} stencil"),
-            ("what is matched", found.match),
+            ("what is matched", found.match or "differences"),
         ]
     rows += _returns(looked)
     print("\n".join(printable(f"{name:20}{value}") for name, value in rows))
