@@ -234,6 +234,7 @@ def test_a_process_ends_with_the_code_of_its_error(arguments, code, tmp_path):
     assert failed.stdout == ""
     assert failed.stderr.startswith("fdtasil: ")
     assert ("next step: " in failed.stderr) == (code == 1)
+    assert not list(tmp_path.iterdir())  # not even an empty runs/
     assert "Traceback" not in failed.stderr
 
 

@@ -234,7 +234,7 @@ def _checked_radius(radius: object) -> Radius:
     ends = tuple(check_number("radius", end, positive=True) for end in radius)
     if len(ends) != 2 or not ends[0] <= ends[1]:
         raise SettingError(
-            spelt("radius", radius), "the nearest and the farthest", "write radius=(0.05, 2)"
+            spelt("radius", radius), "the nearest and the farthest", "write radius=0.2..2"
         )
     return ends
 

@@ -63,8 +63,8 @@ def _distill(baseline: bool, **arguments: Any) -> None:
         else:
             result = distil({**arguments, **place})  # it stays in its own folder
         print(_side_by_side(result, cloning()))
-    chosen = result.report["probes_chosen"]
-    print(f"queries: {rows_text(result.queries)}" + (f" ({chosen})" if chosen else ""))
+    chosen = result.report.get("probes_chosen")
+    print(f"queries: {rows_text(result.queries)}" + (f" ({shown(chosen)})" if chosen else ""))
     print(f"saved in {out}: student.onnx, student.safetensors, report.json, figures/, ...")
 
 
@@ -79,6 +79,7 @@ def _remembering(arguments: dict[str, Any], folder: Path) -> Iterator[None]:
     if is_written(folder):
         print(f"{arguments['out']} holds a finished run, which this one replaces", file=sys.stderr)
     plain = {k: str(v) if isinstance(v, Path) else v for k, v in arguments.items()}
+    alone = not folder.parent.exists()
     with locked(folder):  # another run's arguments stay its own
         before = read_plain(path, _LIMIT, follow=False) if path.exists() else None
         expert = plain["expert"] or ""
@@ -92,6 +93,8 @@ def _remembering(arguments: dict[str, Any], folder: Path) -> Iterator[None]:
             if before is None:
                 remove_file(path)
                 remove_if_empty(folder)
+                if alone:
+                    remove_if_empty(folder.parent)
             else:
                 write_bytes(path, before)
         raise
