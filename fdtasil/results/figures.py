@@ -16,22 +16,30 @@ _STUDENT, _EXPERT = "#1f77b4", "#444444"
 
 
 def draw_training(history: Sequence[dict[str, float]]) -> bytes:
-    """Draw the action error and the derivative error against the training step, as a PNG."""
-    with_probes = any(entry["derivative_error"] > 0 for entry in history)
+    """Draw the errors that a student was trained on against the training step, as a PNG."""
+    from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
+
+    titles = {
+        "action_error": "error of the actions",
+        "moved_error": "at the moved states",
+        "derivative_error": "of the whitened Jacobian",
+    }
+    # An older run knows no labels at moved states.
+    drawn = [name for name in titles if any(entry.get(name, 0) > 0 for entry in history)]
     figure = _figure(7.0, 3.0)
-    panels = figure.subplots(1, 2 if with_probes else 1, squeeze=False)[0]
+    panels = figure.subplots(1, max(1, len(drawn)), squeeze=False)[0]
     steps = _cumulative_steps(history)
-    names = ("action_error", "derivative_error")
-    titles = ("error of the actions", "error of the whitened Jacobian")
-    for panel, name, title in zip(panels, names, titles, strict=False):
+    for panel, name in zip(panels, drawn, strict=False):
         panel.plot(steps, [entry[name] for entry in history], color=_STUDENT, linewidth=1.4)
         panel.set_yscale("log")
-        for axis_formatter in (panel.yaxis.set_major_formatter, panel.yaxis.set_minor_formatter):
-            axis_formatter("{x:.2g}")
-        panel.set_title(title, fontsize=9)
+        panel.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        panel.yaxis.set_major_formatter("{x:.2g}")
+        panel.yaxis.set_minor_formatter(NullFormatter())
+        panel.xaxis.set_major_locator(MaxNLocator(4, integer=True))
+        panel.set_title(titles[name], fontsize=9)
         panel.set_xlabel("training step")
-        panel.set_ylabel("mean norm")
         panel.grid(alpha=0.3, which="both", linewidth=0.5)
+    panels[0].set_ylabel("mean norm")
     return png_of(figure)
 
 
