@@ -10,7 +10,7 @@ import fdtasil
 from benchmarks.comparison import draw_methods, scores_of
 from benchmarks.controllers import CONTROLLERS
 from benchmarks.distillation import HORIZON, call_of, distil
-from benchmarks.grid import SEEDS, experts
+from benchmarks.grid import SEEDS, experts, side_by_side
 from benchmarks.runner import Benchmark, Cell, Row
 from fdtasil.probes.answers import Answers
 from fdtasil.probes.scales import measure_scales
@@ -43,14 +43,7 @@ PAIRS = (
 
 def cells(quick: bool) -> list[Cell]:
     """Every budget, seed, expert and method."""
-    names = experts()
-    return [
-        {"expert": expert, "episodes": budget, "method": method, "seed": seed}
-        for budget in (BUDGETS[:1] if quick else BUDGETS)
-        for seed in (range(2) if quick else SEEDS)
-        for expert in (names[:1] if quick else names)
-        for method in METHODS
-    ]
+    return side_by_side(quick, BUDGETS, experts(), METHODS)
 
 
 def measure(cell: Cell, device: str) -> dict[str, Any]:

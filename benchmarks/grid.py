@@ -1,10 +1,12 @@
 """What benchmarks of the paper's experts have in common: experts, seeds, methods, their names."""
 
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 from benchmarks.controllers import available
+from benchmarks.runner import Cell
 
-__all__ = ["SEEDS", "STANDARD_METHODS", "experts", "label"]
+__all__ = ["SEEDS", "STANDARD_METHODS", "experts", "label", "side_by_side"]
 
 SEEDS = range(5)
 ENVIRONMENTS = ("Walker2d", "HalfCheetah", "Ant", "Humanoid")
@@ -30,6 +32,27 @@ def experts() -> list[str]:
     """Return the paper's experts where they are, this project's otherwise."""
     here = available(*(f"paper/{name}" for name in ENVIRONMENTS))
     return here or available(*(f"{name}-v5" for name in ENVIRONMENTS))
+
+
+def side_by_side(
+    quick: bool, budgets: Sequence[int], names: Sequence[str], methods: Iterable[str]
+) -> list[Cell]:
+    """Return a cell for every budget, seed, expert and method.
+
+    Args:
+        quick: Whether to take two seeds of the first budget and expert only.
+        budgets: Numbers of trajectories.
+        names: Of experts.
+        methods: Side by side.
+    """
+    methods = list(methods)
+    return [
+        {"expert": expert, "episodes": budget, "method": method, "seed": seed}
+        for budget in (budgets[:1] if quick else budgets)
+        for seed in (range(2) if quick else SEEDS)
+        for expert in (names[:1] if quick else names)
+        for method in methods
+    ]
 
 
 def label(method: str) -> str:

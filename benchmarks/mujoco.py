@@ -6,7 +6,7 @@ from typing import Any
 from benchmarks.comparison import Column, Scores, draw_scores, scores_of, scores_text
 from benchmarks.controllers import available
 from benchmarks.distillation import distillations, usual_arguments
-from benchmarks.grid import SEEDS, experts
+from benchmarks.grid import SEEDS, experts, side_by_side
 from benchmarks.runner import Cell, Row
 
 __all__ = ["BENCHMARK"]
@@ -38,13 +38,7 @@ PAIRS = (
 def cells(quick: bool) -> list[Cell]:
     """Every budget, seed, expert and method."""
     names = [*experts(), *available("Swimmer-v5")]
-    return [
-        {"expert": expert, "episodes": budget, "method": method, "seed": seed}
-        for budget in (BUDGETS[:1] if quick else BUDGETS)
-        for seed in (range(2) if quick else SEEDS)
-        for expert in (names[:1] if quick else names)
-        for method in METHODS
-    ]
+    return side_by_side(quick, BUDGETS, names, METHODS)
 
 
 def arguments(cell: Cell) -> dict[str, Any]:

@@ -24,6 +24,15 @@ def smooth_expert(n=6, m=3):
     return Student(Mlp((32, 32)), zeros, ones, -np.ones(m), np.ones(m), random).eval()
 
 
+def weaker_expert(n=6):
+    """The expert with smaller weights, as a student that has something to learn."""
+    student = smooth_expert(n)
+    with torch.no_grad():
+        for parameter in student.parameters():
+            parameter.mul_(0.8)
+    return student
+
+
 def batch_of(module, spec, states, order=1):
     """The whole stencil of every state, and which it is."""
     probes = (
@@ -63,10 +72,7 @@ def test_the_loss_is_zero_at_the_expert(states, spec):
 
 def test_the_analytic_loss_and_gradient_agree_with_the_differences(states):
     """Standard basis, central; the analytic Jacobian taken along the same directions."""
-    expert, student = smooth_expert(), smooth_expert()
-    with torch.no_grad():
-        for parameter in student.parameters():
-            parameter.mul_(0.8)
+    expert, student = smooth_expert(), weaker_expert()
     found = {}
     for spec in ("basis,central,radius=0.02", "jacobian"):
         student.zero_grad()
@@ -93,10 +99,7 @@ def test_a_linear_difference_is_the_exact_derivative(states):
 
 
 def test_labels_are_the_action_error_at_the_moved_states(states):
-    expert, student = smooth_expert(), smooth_expert(m=3)
-    with torch.no_grad():
-        for parameter in student.parameters():
-            parameter.mul_(0.8)
+    expert, student = smooth_expert(), weaker_expert()
     batch, stencil = batch_of(expert, "sphere:1,labels,radius=0.5..3", states)
     loss = taylor_loss(student, batch, stencil, Fit().weights("labels"))
     moved = batch.observations + batch.probes.displacements[:, 0]
@@ -109,10 +112,7 @@ def test_labels_are_the_action_error_at_the_moved_states(states):
 
 def test_both_are_the_sum_of_labels_and_differences(states):
     """Each difference is measured in units of its own distance."""
-    expert, student = smooth_expert(), smooth_expert(m=3)
-    with torch.no_grad():
-        for parameter in student.parameters():
-            parameter.mul_(0.8)
+    expert, student = smooth_expert(), weaker_expert()
     batch, stencil = batch_of(expert, "sphere:1,both,radius=0.5..3", states)
     weights = Fit(weight=0.25, moved_weight=2.0).weights("both")
     loss = taylor_loss(student, batch, stencil, weights)
@@ -140,10 +140,7 @@ def test_distances_are_spread_evenly_over_their_orders_of_magnitude(states):
 def test_second_differences_agree_with_exact_second_derivatives():
     """Ten inputs, the same directions: central differences against the analytic reference."""
     states = np.random.default_rng(0).standard_normal((40, 10)).astype(np.float32)
-    expert, student = smooth_expert(10), smooth_expert(10)
-    with torch.no_grad():
-        for parameter in student.parameters():
-            parameter.mul_(0.8)
+    expert, student = smooth_expert(10), weaker_expert(10)
     found = {}
     for spec in ("orthogonal:10,central,radius=0.05", "jacobian"):
         student.zero_grad()

@@ -1,6 +1,6 @@
 """What a query of an expert costs, as its kind and size say, and never as a clock does."""
 
-from collections.abc import Iterable
+import math
 from typing import TYPE_CHECKING, Any
 
 import torch
@@ -39,9 +39,8 @@ _ONCE = OPERATORS.keys() | {
     "TreeEnsembleRegressor",
     "Where",
 }
-_RIGHT = {"QLinearMatMul": 3, "QGemm": 3}
-_PRODUCTS = {"Gemm", "MatMul", "MatMulInteger", *_RIGHT}
-"""Operators that multiply matrices, and which input is the right one, if it is not the second."""
+# Which input of a product of matrices is the right one.
+_RIGHT = {"Gemm": 1, "MatMul": 1, "MatMulInteger": 1, "QLinearMatMul": 3, "QGemm": 3}
 
 
 def multiply_adds(expert: Expert, observation_size: int) -> int | None:
@@ -71,35 +70,28 @@ def stored_numbers(model: "onnx.ModelProto") -> int | None:
     nodes = model.graph.node
     if model.functions or len(nodes) > _MANY or not {n.op_type for n in nodes} <= _ONCE:
         return None
-    if any(n.op_type in _PRODUCTS and not _is_of_weights(n, model) for n in nodes):
-        return None
-    held = sum(_product(tensor.dims) for tensor in model.graph.initializer)
+    matrices = _matrices(model)
+    if any(n.op_type in _RIGHT and n.input[_RIGHT[n.op_type]] not in matrices for n in nodes):
+        return None  # a row meets a matrix of the file once, and others who knows how often
+    held = sum(math.prod(tensor.dims) for tensor in model.graph.initializer)
     for node in nodes:
         for entry in node.attribute:
-            held += max(len(entry.floats), len(entry.ints), _product(entry.t.dims))
+            held += max(len(entry.floats), len(entry.ints), math.prod(entry.t.dims))
     return held
 
 
-def _is_of_weights(node: "onnx.NodeProto", model: "onnx.ModelProto") -> bool:
-    """Whether a product has a matrix of the file on its right: a row then meets each number once.
+def _matrices(model: "onnx.ModelProto") -> set[str]:
+    """Return the names of the values that are matrices of the file.
 
-    Of a quantised network that matrix comes out of a node that has numbers of the file alone.
+    Of a quantised network they come out of nodes that have numbers of the file alone.
     """
-    held = {tensor.name: len(tensor.dims) for tensor in model.graph.initializer}
-    for other in model.graph.node:
-        if other.op_type == "DequantizeLinear" and set(other.input) <= held.keys():
-            held[other.output[0]] = held[other.input[0]]
-        if other.op_type == "Constant":
-            held[other.output[0]] = len(other.attribute[0].t.dims)
-    right = node.input[_RIGHT.get(node.op_type, 1)]
-    return held.get(right) == 2
-
-
-def _product(sizes: Iterable[int]) -> int:
-    product = 1
-    for size in sizes:
-        product *= size
-    return product
+    axes = {tensor.name: len(tensor.dims) for tensor in model.graph.initializer}
+    for node in model.graph.node:
+        if node.op_type == "DequantizeLinear" and set(node.input) <= axes.keys():
+            axes[node.output[0]] = axes[node.input[0]]
+        if node.op_type == "Constant":
+            axes[node.output[0]] = len(node.attribute[0].t.dims)
+    return {name for name, count in axes.items() if count == 2}
 
 
 def _counted(module: torch.nn.Module, observation_size: int) -> int | None:

@@ -98,7 +98,8 @@ class Calibration:
         """Return the source with what it leaves open filled in; warn of a radius that misleads."""
         radius = self.radius if probes.radius is None else probes.radius
         if radius == "wide":
-            radius = max(WIDE[0], self._nearest()), max(WIDE[1], self._nearest())
+            nearest = self._nearest()
+            radius = max(WIDE[0], nearest), max(WIDE[1], nearest)
         elif probes.radius is not None and probes.space == "whitened":
             for end in sorted(set(replace(probes, radius=radius).reaches)):
                 self._warn_of(end)
@@ -136,7 +137,7 @@ class Calibration:
         noise = 2**0.5 * self.noise_floor
         coherent, best = self.similarity_at(radius), self.similarity_at(self.radius)
         reason = None
-        if self.regime != "steps" and noise > _NOISY_SHARE * change:
+        if self.regime != "steps" and not self._heard(change):
             reason = f"{min(1.0, noise / change):.0%} of a difference there is noise"
         elif coherent < 0.5 * best:
             reason = f"differences there and at a quarter of it agree to {coherent:.2f} only"

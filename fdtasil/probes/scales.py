@@ -7,14 +7,15 @@ import numpy as np
 
 from fdtasil.errors import SettingError
 
-__all__ = ["Scales", "measure_scales"]
+__all__ = ["ROUNDING", "Scales", "measure_scales"]
 
 # A coordinate whose deviation is below this share of the median one does not move: what is left
 # is rounding (Humanoid has one of 1.8e-14), and dividing by it would blow up the first bump.
 _STILL = 1e-4
 # The normaliser divides by no less than this share of the median deviation.
 _FLOOR = 1e-2
-_ROUNDING = 64 * float(np.finfo(np.float32).eps)
+ROUNDING = 64 * float(np.finfo(np.float32).eps)
+"""Share of its values below which a coordinate's movement is rounding."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +75,7 @@ def measure_scales(observations: np.ndarray, seen: np.ndarray | None = None) -> 
     """
     wide = observations.astype(np.float64)
     mean, deviation = wide.mean(axis=0), wide.std(axis=0)
-    moving = deviation > _ROUNDING * np.abs(wide).max(axis=0)
+    moving = deviation > ROUNDING * np.abs(wide).max(axis=0)
     if not moving.any():  # a single state tells nothing of scales: raw units
         moving, deviation = np.ones_like(moving), np.ones_like(deviation)
     median = float(np.median(deviation[moving]))

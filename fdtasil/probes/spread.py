@@ -8,6 +8,7 @@ import numpy as np
 
 from fdtasil.checks import check_count, check_number, spelt
 from fdtasil.errors import SettingError
+from fdtasil.probes.scales import ROUNDING
 
 __all__ = ["Spread", "SpreadLike", "stands_still"]
 
@@ -16,7 +17,6 @@ SpreadLike = Mapping[int, float] | str
 deviations of uniform values in the bounds of the observations."""
 
 _STILL = 1e-3  # of what a coordinate varies between episodes, that it may vary within one
-_ROUNDING = 64 * float(np.finfo(np.float32).eps)
 _EXPECTED = 'a deviation for each coordinate, or "bounds"'
 _EXAMPLE = "write for example spread={0: 0.5}"
 
@@ -113,7 +113,7 @@ def stands_still(observations: np.ndarray, episode: np.ndarray) -> np.ndarray:
     numbers = np.unique(episode)
     means = np.stack([observations[episode == e].mean(axis=0, dtype=np.float64) for e in numbers])
     between = means.std(axis=0)
-    differs = between > _ROUNDING * np.abs(means).max(axis=0)
+    differs = between > ROUNDING * np.abs(means).max(axis=0)
     return differs & (_widest_within(observations, episode) <= _STILL * between)
 
 

@@ -69,7 +69,7 @@ class Surroundings:
             again: Whether they were looked at before, and what there is to warn of was said.
 
         Raises:
-            SettingError: If no coordinate moves, or a step is lost in rounding or beyond float32.
+            SettingError: If no coordinate moves, or a step is beyond float32.
         """
         live = np.flatnonzero(scales.probed(probes.space))
         raw, usual = probes.space == "raw", probes.directions.reach(len(live))
@@ -95,7 +95,7 @@ class Surroundings:
     def sample(self, random: np.random.Generator) -> Drawn:
         """Draw directions, and how far each of them leads."""
         bank, numbers = self.draw(len(self.observations), random)
-        bank = bank.astype(np.float32)
+        bank = bank.astype(np.float32, copy=False)
         stretch = np.ones((len(bank), 1))
         if self.ends[0] != self.ends[1]:
             near, far = np.log(self.ends)

@@ -36,8 +36,7 @@ def follow(policy: Policy) -> Behaviour:
 
 def random_behaviour(pool: EnvironmentPool) -> Behaviour:
     """Return the behaviour of uniformly random actions; unbounded ones are standard normal."""
-    low, high = pool.boxes.low, pool.boxes.high
-    bounded = np.isfinite(low) & np.isfinite(high)
+    low, high, bounded = pool.boxes.low, pool.boxes.high, pool.boxes.bounded
 
     def act(observations: np.ndarray, noise: Sequence[np.random.Generator]) -> Decision:
         rows = []

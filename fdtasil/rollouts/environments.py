@@ -43,6 +43,11 @@ class Boxes:
         """m, the length of an action."""
         return len(self.low)
 
+    @property
+    def bounded(self) -> np.ndarray:
+        """(m,) bool, the actions that have both bounds."""
+        return np.isfinite(self.low) & np.isfinite(self.high)
+
 
 @dataclass(frozen=True)
 class OwnBounds:

@@ -117,8 +117,7 @@ class Collecting:
             return self._episodes(behaviour, f"extra {round_}", 0, extra)
 
         boxes = self.pool.boxes
-        bounded = np.isfinite(boxes.low) & np.isfinite(boxes.high)
-        half = np.where(bounded, (boxes.high - boxes.low) / 2, np.float32(1))
+        half = np.where(boxes.bounded, (boxes.high - boxes.low) / 2, np.float32(1))
         situation = Situation(round_, self.expert, half, student, record_extra)
         return self.trainer.behaviour(situation)
 

@@ -155,8 +155,8 @@ class Configuration:
     @property
     def can_spread(self) -> bool:
         """Whether probes are asked in units of deviations, which may be said to be others."""
-        asked = self.probes is not None and not self.probes_given
-        return asked and self.probes is not None and self.probes.space == "whitened"
+        probes = self.probes
+        return probes is not None and not self.probes_given and probes.space == "whitened"
 
     def check_spread(self) -> None:
         """Refuse deviations that no probe is moved by; plain cloning normalises by them.

@@ -68,16 +68,21 @@ class Rounds:
             policy = lesson.view.policy(trained.student.act) if lesson and trained else None
             lesson = self._learnt_from(round_, count, collected, lesson, policy)
             collected = lesson.collected
-            if round_ == 0 and expert is not None and self.collecting is not None:
-                warn_of_falls(collected.dataset.demonstrations, expert, self.run.keep)
-            if round_ == len(self.run.rounds) - 1 and expert is not None and self.run.can_spread:
-                warn_of_still_coordinates(lesson, expert)
+            if expert is not None:
+                self._doubt(round_, lesson, expert)
             trained = self._trained(round_, lesson, trained)
             last = trained.history[-1]
             self.training.callback(Event("round", round_, trained.steps, last, trained.student))
         assert lesson is not None
         assert trained is not None, "every run has a round"
         return lesson, trained
+
+    def _doubt(self, round_: int, lesson: Lesson, expert: Episodes) -> None:
+        """Warn of what the demonstrations lack, as soon as it is known."""
+        if round_ == 0 and self.collecting is not None:
+            warn_of_falls(lesson.dataset.demonstrations, expert, self.run.keep)
+        if round_ == len(self.run.rounds) - 1 and self.run.can_spread:
+            warn_of_still_coordinates(lesson, expert)
 
     def _trained(self, round_: int, lesson: Lesson, before: Trained | None) -> Trained:
         with self.training.interrupts.held_back():
