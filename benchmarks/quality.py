@@ -13,8 +13,8 @@ from benchmarks.tables import table
 
 __all__ = ["BENCHMARK"]
 
-# Episodes and steps: the usual budget, little data, and the whole length of an episode.
-BUDGETS = ((5, 300), (2, 300), (1, 300), (5, 1000))
+# Episodes and steps: the usual budget, little data, whole episodes, and the default call's.
+BUDGETS = ((5, 300), (2, 300), (1, 300), (5, 1000), (20, 1000))
 FRESH, STORED, PLAIN = PROBES = ("fresh", 10, 0)  # these experts' default is the first
 _NAMES = {PLAIN: "plain cloning", STORED: "10 probes", FRESH: "fresh"}
 

@@ -1,9 +1,11 @@
 """What a training step, a query and an environment step cost, as ratios to what they must."""
 
 import statistics
+import tempfile
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -16,8 +18,10 @@ from benchmarks.runner import Benchmark, Cell, Row
 from benchmarks.tables import table
 from fdtasil.compute import torch_settings
 from fdtasil.demonstrations.states import Demonstrations
+from fdtasil.experts.expert import Expert
 from fdtasil.experts.load import load_expert
 from fdtasil.probes.answers import Answers, ask_probes
+from fdtasil.probes.device_twin import DeviceTwin
 from fdtasil.probes.scales import measure_scales
 from fdtasil.probes.source import Probes
 from fdtasil.probes.surroundings import Surroundings
@@ -27,14 +31,15 @@ from fdtasil.rollouts.rollout import rollout
 from fdtasil.run.presets import PRESETS
 from fdtasil.seeding import torch_generator
 from fdtasil.student.architectures import Mlp
+from fdtasil.student.exports import export
 from fdtasil.student.fit import Fit, fit
 from fdtasil.student.policy import Student
 
 __all__ = ["BENCHMARK"]
 
 SIZES = ((17, 6), (376, 17))
-SOURCES = (None, "sphere:10", "sphere:50", "sphere:10,resample")
-HIDDEN = 512
+SOURCES = (None, "sphere:10", "sphere:50", "sphere:10,resample", "fresh")
+HIDDEN = (512, 256)  # the usual student, and that of an expert that is asked anew
 BATCH = 100
 STATES = 1500
 STEPS = 150
@@ -45,9 +50,13 @@ BATCHES = (64, 256, 1024, 4096)
 
 def cells(quick: bool) -> list[Cell]:
     """One cell for each size of a step, each expert that is asked, each environment stepped."""
-    found: list[Cell] = [{"what": "step", "size": list(size)} for size in SIZES]
-    if torch.cuda.is_available():
-        found += [{"what": "step on a GPU", "size": list(size)} for size in SIZES]
+    kinds = ["step", "step on a GPU"] if torch.cuda.is_available() else ["step"]
+    found: list[Cell] = [
+        {"what": what, "size": list(size), "hidden": hidden}
+        for what in kinds
+        for size in SIZES
+        for hidden in HIDDEN
+    ]
     experts = [name for name in available() if not name.startswith("paper/")]
     if quick:
         experts = experts[:1]
@@ -63,8 +72,8 @@ def measure(cell: Cell, device: str) -> dict[str, Any]:
 
 def _step(cell: Cell) -> dict[str, Any]:
     """Milliseconds of a step without and with probes, taken in turn, and of the floor."""
-    n, m = cell["size"]
-    tasks = {source: _task(n, m, source) for source in SOURCES}
+    n, m, hidden = *cell["size"], cell["hidden"]
+    tasks = {source: _task(n, m, hidden, source) for source in SOURCES}
     times: dict[str, list[float]] = {str(source): [] for source in SOURCES}
     times["floor"] = []
     for task in tasks.values():  # the first run of a process pays for what later ones find done
@@ -72,15 +81,15 @@ def _step(cell: Cell) -> dict[str, Any]:
     for _ in range(ROUNDS):
         for source, task in tasks.items():
             times[str(source)].append(_seconds(task) / STEPS * 1e3)
-        times["floor"].append(_floor(n, m) * 1e3)
+        times["floor"].append(_floor(n, m, hidden) * 1e3)
     return {"milliseconds": times}
 
 
 def _step_on_a_gpu(cell: Cell) -> dict[str, Any]:
     """Milliseconds of a step on the CPU and on the GPU, there of a whole training."""
-    n, m = cell["size"]
+    n, m, hidden = *cell["size"], cell["hidden"]
     tasks = {
-        f"{source}, {device}": (_task(n, m, source, device, steps), steps)
+        f"{source}, {device}": (_task(n, m, hidden, source, device, steps), steps)
         for source in SOURCES
         for device, steps in (("cpu", STEPS), ("cuda", Fit().schedule().total_steps(STATES)))
     }
@@ -94,12 +103,11 @@ def _step_on_a_gpu(cell: Cell) -> dict[str, Any]:
 
 
 def _task(
-    n: int, m: int, spec: str | None, device: str = "cpu", steps: int = STEPS
+    n: int, m: int, hidden: int, spec: str | None, device: str = "cpu", steps: int = STEPS
 ) -> Callable[[], object]:
     random = np.random.default_rng(0)
     observations = random.standard_normal((STATES, n)).astype(np.float32)
-    gain = random.standard_normal((n, m)).astype(np.float32) / n**0.5
-    expert = load_expert(lambda rows: np.tanh(rows @ gain))
+    expert = _expert(n, m, observations)
     number, actions = np.arange(STATES, dtype=np.int32) // 300, expert.ask(observations, "label")
     demonstrations = Demonstrations(
         observations, actions, number, number, actions, np.zeros(STATES), number > 9
@@ -109,23 +117,23 @@ def _task(
     probes = probes.with_order(1) if probes else None
     scales, settings = measure_scales(observations), preset.fit_with(steps=steps)
     ones = np.ones(m, np.float32)
+    around = Surroundings.of(observations, probes, scales) if probes else None
+    # Stored answers are asked once for a whole training, of which this is a short piece.
+    stored = ask_probes(expert, around, np.random.default_rng(0)) if around else None
+    twin = None
+    if device == "cuda" and around and stored:
+        twin = DeviceTwin.of(expert, around, stored, torch.device(device))
 
     def run() -> None:
         start = torch_generator(0, "student")
-        student = Student(Mlp((HIDDEN, HIDDEN)), scales.mean, scales.scale, -ones, ones, start)
+        student = Student(Mlp((hidden, hidden)), scales.mean, scales.scale, -ones, ones, start)
         fit(student.to(device), demonstrations, probes, ask if probes else None, settings, stream)
 
-    around = Surroundings.of(observations, probes, scales) if probes else None
-
-    def asked(sample: int) -> Answers:
-        assert around is not None
-        return ask_probes(expert, around, np.random.default_rng(sample))
-
-    # Stored answers are asked once for a whole training, of which this is a short piece.
-    stored = asked(0) if probes else None
-
     def ask(sample: int) -> Answers:
-        return asked(sample) if sample or stored is None else stored
+        assert around is not None, "asked only with probes"
+        assert stored is not None
+        random, asked = np.random.default_rng(sample), twin and twin.values
+        return ask_probes(expert, around, random, asked=asked) if sample else stored
 
     def stream(name: str) -> torch.Generator:
         return torch_generator(0, name)
@@ -133,11 +141,21 @@ def _task(
     return run
 
 
-def _floor(n: int, m: int) -> float:
+def _expert(n: int, m: int, observations: np.ndarray) -> Expert:
+    """Return an ONNX file of the usual size of an agent, 256 x 256, with weights by chance."""
+    zeros, ones, bounds = np.zeros(n), np.ones(n), np.ones(m, np.float32)
+    network = Student(Mlp((256, 256)), zeros, ones, -bounds, bounds, torch_generator(1))
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "expert.onnx"
+        path.write_bytes(export(network, observations, {}, path))
+        return load_expert(path)
+
+
+def _floor(n: int, m: int, hidden: int) -> float:
     """Seconds that the products and the optimiser's traffic of a plain step take at best."""
-    weights = n * HIDDEN + HIDDEN * HIDDEN + HIDDEN * m
+    weights = n * hidden + hidden * hidden + hidden * m
     # Forward, gradients of the weights, gradients of the inputs of all layers but the first.
-    products = 2 * BATCH * (3 * weights - n * HIDDEN)
+    products = 2 * BATCH * (3 * weights - n * hidden)
     # AdamW reads weights, gradients and two moments, and writes all but the gradients.
     traffic = 7 * 4 * weights
     left, right = torch.randn(1024, 1024), torch.randn(1024, 1024)
@@ -216,17 +234,19 @@ def draw(rows: Sequence[Row]) -> dict[str, bytes]:
     for row in rows:
         cell, result = row["cell"], row["result"]
         if cell["what"] == "step":
-            times, name = result["milliseconds"], "{}/{}".format(*cell["size"])
+            times, name = result["milliseconds"], _network(cell)
             for source in (str(source) for source in SOURCES[1:]):
                 lines.append(
                     _line(f"step, {source}, {name}", "plain", times[source], times["None"])
                 )
             lines.append(_line(f"plain step, {name}", "floor", times["None"], times["floor"]))
         elif cell["what"] == "step on a GPU":
-            times, name = result["milliseconds"], "{}/{}".format(*cell["size"])
+            times, name = result["milliseconds"], f"{_network(cell)}, {result['gpu']}"
             for source in map(str, SOURCES):
-                what = f"step, {source.replace('None', 'plain')}, {name}, {result['gpu']}"
+                what = f"step, {source.replace('None', 'plain')}, {name}"
                 lines.append(_line(what, "CPU", times[f"{source}, cuda"], times[f"{source}, cpu"]))
+            fresh, stored = (times[f"{source}, cuda"] for source in ("fresh", "sphere:10"))
+            lines.append(_line(f"step, fresh, {name}", "sphere:10", fresh, stored))
         elif cell["what"] == "asking":
             rates = result["rows_per_second"]
             lines.append(_line(f"rows, {cell['expert']}", "session", rates["ours"], rates["bare"]))
@@ -237,6 +257,10 @@ def draw(rows: Sequence[Row]) -> dict[str, bytes]:
             )
     text = table(["what", "of", "ratio, minimum", "median"], lines)
     return {"speed.md": f"{text}\nOne thread.\n".encode()}
+
+
+def _network(cell: Cell) -> str:
+    return "{}/{}".format(*cell["size"]) + f", {cell['hidden']} wide"
 
 
 def _line(what: str, of: str, ours: Sequence[float], theirs: Sequence[float]) -> list[str]:

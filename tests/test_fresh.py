@@ -1,5 +1,7 @@
 """Experts that are asked anew at every visit, and who is asked so where nobody says it."""
 
+from dataclasses import replace
+
 import gymnasium
 import numpy as np
 import pytest
@@ -9,12 +11,16 @@ from onnx import TensorProto
 from toy_environments import Integrator
 
 import fdtasil
-from fdtasil.errors import SettingError
+from fdtasil.errors import ExpertError, SettingError
 from fdtasil.experts.cost import CHEAP, multiply_adds
+from fdtasil.experts.load import load_expert
+from fdtasil.probes.answers import ask_probes
 from fdtasil.probes.calibration import calibrate
+from fdtasil.probes.device_twin import DeviceTwin
 from fdtasil.probes.scales import measure_scales
 from fdtasil.probes.source import Probes
 from fdtasil.probes.surroundings import Surroundings
+from fdtasil.run.presets import PRESETS
 from fdtasil.seeding import episode_seeds
 from fdtasil.student.fit import Fit
 
@@ -379,3 +385,57 @@ def test_deviations_that_no_probe_is_moved_by_are_refused(source):
 )
 def test_many_distances_alone_make_labels(spec, match):
     assert Probes.parse(spec).with_order(1).match == match
+
+
+class Module(torch.nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.weight = torch.nn.Parameter(torch.from_numpy(GAIN))
+
+    def forward(self, observations):
+        """(B, 5) -> (B, 2)."""
+        return observations @ self.weight.T
+
+
+def fresh_around(states):
+    preset = replace(PRESETS["standard"], calibrated=False)
+    source = preset.complete(Probes.parse("fresh:3,radius=0.2..2")).with_order(1)
+    return Surroundings.of(states, source, measure_scales(states))
+
+
+@pytest.mark.parametrize("kind", ["file", "module"])
+def test_a_twin_on_a_device_answers_as_the_expert_and_is_counted(kind, expert):
+    states = np.random.default_rng(0).standard_normal((20, 5)).astype(np.float32)
+    asked = load_expert(expert if kind == "file" else Module())
+    around = fresh_around(states)
+    said = ask_probes(asked, around, np.random.default_rng(0))
+    twin = DeviceTwin.of(asked, around, said, torch.device("cpu"))
+    assert asked.queries["probe"] == 60  # a comparison is no query
+    ours = ask_probes(asked, around, np.random.default_rng(1), asked=twin.values)
+    assert asked.queries["probe"] == 120
+    theirs = ask_probes(asked, around, np.random.default_rng(1))
+    assert np.array_equal(ours.displacements, theirs.displacements)
+    assert ours.values == pytest.approx(theirs.values, abs=1e-5)
+
+
+def test_a_twin_that_answers_otherwise_is_warned_of_and_not_used():
+    states = np.random.default_rng(0).standard_normal((20, 5)).astype(np.float32)
+    asked = load_expert(Module())
+    around = fresh_around(states)
+    said = ask_probes(asked, around, np.random.default_rng(0))
+    other = replace(said, values=said.values + 0.01)
+    with pytest.warns(fdtasil.FdtasilWarning, match="answers moved states otherwise"):
+        assert DeviceTwin.of(asked, around, other, torch.device("cpu")) is None
+    assert DeviceTwin.of(load_expert(linear), around, said, torch.device("cpu")) is None
+
+
+def test_a_twin_that_is_not_finite_is_named():
+    states = np.random.default_rng(0).standard_normal((20, 5)).astype(np.float32)
+    asked = load_expert(Module())
+    around = fresh_around(states)
+    said = ask_probes(asked, around, np.random.default_rng(0))
+    twin = DeviceTwin.of(asked, around, said, torch.device("cpu"))
+    with torch.no_grad():
+        twin.module.weight[0] = torch.nan
+    with pytest.raises(ExpertError, match="not finite on some of 60"):
+        ask_probes(asked, around, np.random.default_rng(1), asked=twin.values)

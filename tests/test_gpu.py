@@ -17,6 +17,7 @@ from fdtasil.student.step import gradient_step
 
 pytestmark = pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
 
+DEVICES = ("cuda", "cpu")
 SPECS = [
     None,
     "4",
@@ -156,6 +157,26 @@ def test_a_run_on_the_gpu_gives_a_student_for_the_cpu(setting):
     assert {weights.device.type for weights in result.student.parameters()} == {"cpu"}
     assert np.isfinite(result.evaluation.normalized_return)
     assert result.settings["device"] == "cuda"
+
+
+def test_a_module_is_asked_anew_on_the_gpu(monkeypatch):
+    """Its own answers travel once for a run; the rest comes from a twin that is compared first."""
+    asked, answer = [], Expert.forward
+
+    def forward(self, observations):
+        asked.append((observations.device.type, len(observations)))
+        return answer(self, observations)
+
+    monkeypatch.setattr(Expert, "forward", forward)
+    run = {**QUICK, "progress": False, "probes": "fresh,radius=0.2..2", "fit": Fit(steps=200)}
+    results = {device: fdtasil.distill(Expert(), TOY, device=device, **run) for device in DEVICES}
+    rows = {device: sum(n for kind, n in asked if kind == device) for device in DEVICES}
+    assert rows["cuda"] > 10 * results["cuda"].dataset.answers.values[..., 0].size
+    queries = {device: result.report["queries"]["probe"] for device, result in results.items()}
+    assert queries["cuda"] == queries["cpu"]
+    states = results["cpu"].dataset.demonstrations.observations
+    ours, theirs = (results[device].student.act(states) for device in DEVICES)
+    assert np.abs(ours - theirs).max() < 0.05
 
 
 @pytest.mark.fault(100)

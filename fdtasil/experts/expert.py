@@ -118,12 +118,16 @@ class Expert:
             SettingError: If the observations are not finite numbers, or have another shape.
         """
         rows = self._rows(observations)
-        self.queries[purpose] += len(rows)
+        self.count(len(rows), purpose)
         starts = range(0, max(len(rows), 1), self.chunk)
         chunks = [rows[start : start + self.chunk] for start in starts]
         if self.workers is not None:
             return np.concatenate(self.workers.each(self._ask_chunk, chunks))
         return np.concatenate([self._ask_chunk(chunk, self.answer) for chunk in chunks])
+
+    def count(self, rows: int, purpose: Purpose) -> None:
+        """Count rows that are answered, here or by a copy of what answers."""
+        self.queries[purpose] += rows
 
     def policy(self, purpose: Purpose) -> Callable[[np.ndarray], np.ndarray]:
         """Return the expert as a policy whose rows are counted under `purpose`."""

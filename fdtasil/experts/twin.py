@@ -1,4 +1,4 @@
-"""A differentiable torch twin of an MLP-type ONNX graph: the analytic reference."""
+"""A torch twin of an MLP-type ONNX graph: differentiable, and quick on a GPU."""
 
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any
@@ -10,11 +10,12 @@ from torch import Tensor
 if TYPE_CHECKING:
     import onnx
 
-__all__ = ["OPERATORS", "torch_twin"]
+__all__ = ["AGREEMENT", "OPERATORS", "torch_twin"]
 
 Operator = Callable[..., Tensor]
 
-_AGREEMENT = 1e-4  # relative to the largest action; float32 networks reach 1e-6
+AGREEMENT = 1e-4
+"""Relative to the largest action; float32 networks reach 1e-6."""
 _LARGEST = 2**27  # numbers in one value of a twin on trial: torch has no limit of memory
 
 
@@ -47,7 +48,7 @@ def torch_twin(
             answers = twin.compute(torch.from_numpy(rows), _LARGEST).numpy()
     except Exception:
         return None
-    tolerance = _AGREEMENT * max(1.0, float(np.abs(expected).max()))
+    tolerance = AGREEMENT * max(1.0, float(np.abs(expected).max()))
     agrees = answers.shape == expected.shape and np.abs(answers - expected).max() <= tolerance
     return twin if agrees else None
 
@@ -60,22 +61,28 @@ class _Twin(torch.nn.Module):
 
         super().__init__()
         graph = model.graph
-        self._constants = {
-            tensor.name: _float32(onnx.numpy_helper.to_array(tensor))
-            for tensor in graph.initializer
-        }
+        self._constants: dict[str, str] = {}  # by name in the graph, of buffers: they go along
+        for tensor in graph.initializer:
+            self._keep(tensor.name, tensor)
         self._input, self._output = graph.input[0].name, output
-        self._nodes = [
-            (
-                node.op_type,  # and not its function: a twin may be sent to another process
-                list(node.input),
-                node.output[0],
-                {a.name: onnx.helper.get_attribute_value(a) for a in node.attribute},
-            )
-            for node in _needed(graph, output)
-        ]
+        self._nodes: list[tuple[str, list[str], str, dict[str, Any]]] = []
+        for node in _needed(graph, output):
+            attributes = {a.name: onnx.helper.get_attribute_value(a) for a in node.attribute}
+            if node.op_type == "Constant":
+                self._keep(node.output[0], attributes["value"])
+                continue
+            # Its name and not its function: a twin may be sent to another process.
+            self._nodes.append((node.op_type, list(node.input), node.output[0], attributes))
         if unknown := {operator for operator, *_ in self._nodes} - OPERATORS.keys():
             raise ValueError(f"{unknown} are no operators of an MLP")
+
+    def _keep(self, name: str, tensor: "onnx.TensorProto") -> None:
+        """Keep a constant of the graph, weights as float32, shapes and axes as they are."""
+        import onnx
+
+        value = torch.from_numpy(np.array(onnx.numpy_helper.to_array(tensor)))
+        self._constants[name] = buffer = f"constant_{len(self._constants)}"
+        self.register_buffer(buffer, value.float() if value.is_floating_point() else value)
 
     def forward(self, observations: Tensor) -> Tensor:
         """(B, n) float32 -> (B, m) float32."""
@@ -84,8 +91,8 @@ class _Twin(torch.nn.Module):
     def compute(self, observations: Tensor, largest: int | None = None) -> Tensor:
         """Do the same, with at most `largest` numbers in a value if that is given."""
         values: dict[str, Any] = {"": None, self._input: observations}
-        for name, constant in self._constants.items():
-            values[name] = constant.to(observations.device)
+        for name, buffer in self._constants.items():
+            values[name] = self.get_buffer(buffer)
         for operator, inputs, output, attributes in self._nodes:
             values[output] = OPERATORS[operator](*(values[name] for name in inputs), **attributes)
             if largest is not None and values[output].numel() > largest:
@@ -101,12 +108,6 @@ def _needed(graph: "onnx.GraphProto", output: str) -> "list[onnx.NodeProto]":
             wanted |= set(node.input) - {""}
             found.append(node)
     return found[::-1]
-
-
-def _float32(array: np.ndarray) -> Tensor:
-    """Return weights as float32, and shapes and axes as they are."""
-    tensor = torch.from_numpy(np.array(array))
-    return tensor.float() if tensor.is_floating_point() else tensor
 
 
 def _gemm(
@@ -126,12 +127,6 @@ def _clip(x: Tensor, low: Tensor | None = None, high: Tensor | None = None) -> T
     return x.clamp(low, high) if low is not None or high is not None else x
 
 
-def _constant(value: "onnx.TensorProto") -> Tensor:
-    import onnx
-
-    return _float32(onnx.numpy_helper.to_array(value))
-
-
 def _gelu(x: Tensor, approximate: bytes = b"none") -> Tensor:
     return torch.nn.functional.gelu(x, approximate=approximate.decode())
 
@@ -149,7 +144,6 @@ OPERATORS: dict[str, Operator] = {
     "Cast": lambda x, to: x,  # the twin computes in float32 throughout
     "Clip": _clip,
     "Concat": lambda *parts, axis: torch.cat(parts, dim=axis),
-    "Constant": _constant,
     "Div": torch.div,
     "Elu": lambda x, alpha=1.0: torch.nn.functional.elu(x, alpha),
     "Erf": torch.erf,

@@ -80,6 +80,7 @@ def ask_probes(
     random: np.random.Generator,
     order: int = 1,
     beginning: Beginning = FROM_THE_START,
+    asked: Callable[[Drawn], np.ndarray] | None = None,
 ) -> Answers:
     """Ask the expert around each state.
 
@@ -89,6 +90,7 @@ def ask_probes(
         random: Draws the directions.
         order: 1, or 2 for exact second derivatives too; a finite stencil has them in its values.
         beginning: What is there already; not used where derivatives are exact.
+        asked: Who answers instead of the expert, all at once; None for itself.
 
     Raises:
         ExpertError: If the stencil is exact and the expert can't be differentiated.
@@ -99,7 +101,9 @@ def ask_probes(
     try:
         _check_room(expert, around)
         drawn = around.sample(random)
-        if probes.exact:
+        if asked is not None:
+            values = asked(drawn)
+        elif probes.exact:
             along = drawn.displacements, drawn.numbers
             values = differentiate(expert, observations, *along, order)
         else:

@@ -13,6 +13,9 @@ __all__ = ["Drawn", "Surroundings"]
 
 # States that a design is shown: enough to tell which displacements can occur.
 _SHOWN = 4096
+# States of one sample share this many sets of directions where the next sample has others: drawing
+# them would take as long as the training.
+_SETS = 128
 _ALONE = 0.25  # share of the directions that move what was told of alone, and as many the others
 _ROUNDED = 0.1  # share of a step that rounding may take before it is warned of
 
@@ -94,7 +97,11 @@ class Surroundings:
 
     def sample(self, random: np.random.Generator) -> Drawn:
         """Draw directions, and how far each of them leads."""
-        bank, numbers = self.draw(len(self.observations), random)
+        states = len(self.observations)
+        sets = min(states, _SETS) if self.probes.resample else states
+        bank, numbers = self.draw(sets, random)
+        if sets < states:
+            numbers = numbers[random.integers(sets, size=states)]
         bank = bank.astype(np.float32, copy=False)
         stretch = np.ones((len(bank), 1))
         if self.ends[0] != self.ends[1]:

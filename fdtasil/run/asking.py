@@ -1,11 +1,13 @@
 """Asking the probes of a run: how far is found first, the budget holds, nothing is asked twice."""
 
 import numpy as np
+import torch
 
 from fdtasil.errors import SettingError
 from fdtasil.experts.expert import Expert
 from fdtasil.probes.answers import FROM_THE_START, Answers, Beginning, ask_probes
 from fdtasil.probes.calibration import Calibration, calibrate
+from fdtasil.probes.device_twin import DeviceTwin
 from fdtasil.probes.scales import Scales
 from fdtasil.probes.surroundings import Surroundings
 from fdtasil.run.account import Account
@@ -58,10 +60,26 @@ class Asking:
         self._askable()
         return Surroundings.of(observations, self.source, scales, again=again)
 
+    def twin(self, around: Surroundings, said: Answers, device: torch.device) -> DeviceTwin | None:
+        """Return who answers on a GPU in the expert's place; see `DeviceTwin.of`."""
+        if device.type != "cuda":
+            return None
+        return DeviceTwin.of(self._askable(), around, said, device)
+
     def ask(
-        self, around: Surroundings, *stream: int, beginning: Beginning = FROM_THE_START
+        self,
+        around: Surroundings,
+        *stream: int,
+        beginning: Beginning = FROM_THE_START,
+        twin: DeviceTwin | None = None,
     ) -> Answers:
         """Ask the probes, along the directions of a named stream.
+
+        Args:
+            around: Where.
+            stream: Round and sample.
+            beginning: What is there already.
+            twin: Who answers instead of the expert.
 
         Raises:
             SettingError: If the budget does not allow it.
@@ -71,16 +89,25 @@ class Asking:
         new = len(around.observations) - known
         due = around.probes.queries(new, len(around.live), visits=1)
         self._account.check_budget(due, self._run.max_queries)
-        return self._ask(around, stream, beginning)
+        return self._ask(around, stream, beginning, twin)
 
-    def ask_again(self, around: Surroundings, *stream: int) -> Answers:
+    def ask_again(
+        self, around: Surroundings, *stream: int, twin: DeviceTwin | None = None
+    ) -> Answers:
         """Ask what the interrupted run had asked already, and has counted."""
         with self._account.asked_before():
-            return self._ask(around, stream, FROM_THE_START)
+            return self._ask(around, stream, FROM_THE_START, twin)
 
-    def _ask(self, around: Surroundings, stream: tuple[int, ...], beginning: Beginning) -> Answers:
+    def _ask(
+        self,
+        around: Surroundings,
+        stream: tuple[int, ...],
+        beginning: Beginning,
+        twin: DeviceTwin | None,
+    ) -> Answers:
         random = generator(self._run.seed, "probes", *stream)
-        return ask_probes(self._askable(), around, random, self._run.order, beginning)
+        asked = twin and twin.values
+        return ask_probes(self._askable(), around, random, self._run.order, beginning, asked)
 
     def _askable(self) -> Expert:
         if self._expert is None:

@@ -4,8 +4,10 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import torch
 
 from fdtasil.probes.answers import Answers
+from fdtasil.probes.device_twin import DeviceTwin
 from fdtasil.probes.surroundings import Surroundings
 from fdtasil.run.asking import Asking
 from fdtasil.run.lesson import Lesson
@@ -22,6 +24,7 @@ class Samples:
         stored: The answers of sample 0.
         lesson: What is learnt, and its scales.
         round: The round.
+        device: Where is trained.
         asked_before: Number of the sample that the interrupted run had asked for last, or -1.
         number: Of the sample in use.
     """
@@ -30,6 +33,7 @@ class Samples:
     stored: Answers
     lesson: Lesson
     round: int
+    device: torch.device
     asked_before: int = -1
     number: int = 0
 
@@ -37,6 +41,11 @@ class Samples:
     def around(self) -> Surroundings:
         """Where the source probes; the same for all samples."""
         return self.asking.around(self.observations, self.lesson.scales, again=True)
+
+    @cached_property
+    def twin(self) -> DeviceTwin | None:
+        """Who answers on the device, or None where the expert itself is asked."""
+        return self.asking.twin(self.around, self.stored, self.device)
 
     @property
     def observations(self) -> np.ndarray:
@@ -57,4 +66,4 @@ class Samples:
 
     def _ask(self, number: int) -> Answers:
         ask = self.asking.ask_again if number == self.asked_before else self.asking.ask
-        return ask(self.around, self.round, number)
+        return ask(self.around, self.round, number, twin=self.twin)

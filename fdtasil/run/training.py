@@ -81,7 +81,7 @@ class Training:
         if self.checkpoints.asking.source is None or stored is None:
             return None
         asked_before = kept.sample if kept else -1
-        return Samples(self.checkpoints.asking, stored, lesson, round_, asked_before)
+        return Samples(self.checkpoints.asking, stored, lesson, round_, self.device, asked_before)
 
     def _fresh(self, seen: Demonstrations, lesson: Lesson, round_: int) -> Student:
         scales, bounds = lesson.normaliser(seen.observations), lesson.dataset
