@@ -71,6 +71,8 @@ RECIPES = {
     # TQC's actor is SAC's; its quantile critics reach the same return in fewer steps.
     "Ant-v5": Recipe(target=4000, algorithm="TQC"),
     "Humanoid-v5": Recipe(target=5000, algorithm="TQC"),
+    # An arm that is told where to go: the goal is part of the observation, and stands still.
+    "Reacher-v5": Recipe(target=-4, steps=200_000, learning_starts=2_000, interval=10_000),
     # Tiny, for tests: minutes to the best possible return, about 9360.
     "InvertedDoublePendulum-v5": Recipe(
         target=9300, stop_return=9300, steps=100_000, learning_starts=1_000, interval=2_500

@@ -63,6 +63,7 @@ __all__ = [
     "distill",
     "evaluate",
     "from_minari",
+    "gains",
     "load_expert",
     "to_minari",
 ]
@@ -75,6 +76,7 @@ _ROOMS = {
     "errors": ("FdtasilError", "FdtasilWarning"),
     "experts.expert": ("Expert",),
     "experts.load": ("load_expert",),
+    "probes.gains": ("gains",),
     "probes.source": ("Probes",),
     "results.distilled": ("Distilled",),
     "results.evaluation": ("Evaluation",),

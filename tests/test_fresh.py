@@ -429,13 +429,13 @@ def test_a_twin_that_answers_otherwise_is_warned_of_and_not_used():
     assert DeviceTwin.of(load_expert(linear), around, said, torch.device("cpu")) is None
 
 
-def test_a_twin_that_is_not_finite_is_named():
+def test_a_twin_that_is_infinite_is_named():
     states = np.random.default_rng(0).standard_normal((20, 5)).astype(np.float32)
     asked = load_expert(Module())
     around = fresh_around(states)
     said = ask_probes(asked, around, np.random.default_rng(0))
     twin = DeviceTwin.of(asked, around, said, torch.device("cpu"))
     with torch.no_grad():
-        twin.module.weight[0] = torch.nan
-    with pytest.raises(ExpertError, match="not finite on some of 60"):
+        twin.module.weight[0] = torch.inf
+    with pytest.raises(ExpertError, match="infinite on some of 60"):
         ask_probes(asked, around, np.random.default_rng(1), asked=twin.values)

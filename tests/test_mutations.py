@@ -257,7 +257,7 @@ class Checkpoints(Reader):
         files[name] = change(files[name], random)
         stage = getattr(checkpoints, place.name.partition("-")[0].upper())
         _, account = checkpoints._read_run(files)
-        taken = Account({}, [])
+        taken = Account({}, {}, [])
         taken.take_up(account)
         taken.to_json()
         content = stage.read(files)

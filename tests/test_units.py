@@ -72,7 +72,7 @@ def gap(unit):
     expert = fdtasil.load_expert(policy(-0.5))
     with EnvironmentPool(scaled) as pool:
         own = rollout(follow(expert.policy("evaluate")), pool, [1, 2], 15)
-        judged = evaluate_pair(policy(-0.3), expert, own, pool, 15, 0, Progress(False))
+        judged = evaluate_pair(follow(policy(-0.3)), expert, own, pool, 15, 0, Progress(False))
     return judged.imitation_gap
 
 

@@ -6,6 +6,8 @@ import numpy as np
 
 from fdtasil.errors import SettingError
 from fdtasil.experts.expert import Expert
+from fdtasil.experts.silence import check_answered
+from fdtasil.rollouts.behaviours import has_none
 from fdtasil.rollouts.episodes import Episodes
 
 __all__ = ["Demonstrations", "label"]
@@ -47,7 +49,7 @@ class Demonstrations:
 
 
 def label(episodes: Episodes, expert: Expert, first_episode: int, round_: int) -> Demonstrations:
-    """Label the visited states with the expert's actions.
+    """Label the visited states with the expert's actions; those without an answer are left out.
 
     The expert is asked only where the behaviour did not ask it already.
 
@@ -59,12 +61,14 @@ def label(episodes: Episodes, expert: Expert, first_episode: int, round_: int) -
 
     Raises:
         SettingError: If no state was visited.
+        ExpertError: If the expert has no answer at most of them.
     """
     valid = episodes.valid
     observations = episodes.observations[valid]
     if not len(observations):
         raise SettingError("no state was recorded", "at least one episode", "raise episodes=")
-    actions, unknown = episodes.expert_actions[valid], ~episodes.answered[valid]
+    actions = episodes.expert_actions[valid]
+    unknown = ~episodes.answered[valid] & ~episodes.refused[valid]
     if unknown.any():
         actions[unknown] = expert.ask(observations[unknown], "label")
     numbers = np.arange(first_episode, first_episode + len(valid), dtype=np.int32)
@@ -73,4 +77,9 @@ def label(episodes: Episodes, expert: Expert, first_episode: int, round_: int) -
     taken, rewards = episodes.actions[valid], episodes.rewards[valid]
     last = np.arange(valid.shape[1]) == episodes.lengths[:, None] - 1
     terminated = (last & episodes.terminated[:, None])[valid]
-    return Demonstrations(observations, actions, episode, rounds, taken, rewards, terminated)
+    whole = Demonstrations(observations, actions, episode, rounds, taken, rewards, terminated)
+    none = has_none(actions)
+    if not none.any():
+        return whole
+    check_answered(expert.name, expert.silence, int(none.sum()), len(none), "visited states")
+    return Demonstrations(*(part[~none] for part in vars(whole).values()))

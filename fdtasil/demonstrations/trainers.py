@@ -10,7 +10,7 @@ import numpy as np
 from fdtasil.checks import check_choice, check_count, check_number, check_share, spelt
 from fdtasil.errors import SettingError
 from fdtasil.experts.expert import Expert
-from fdtasil.rollouts.behaviours import Behaviour, Decision, Policy
+from fdtasil.rollouts.behaviours import Behaviour, Decision, Policy, has_none, silent_rows
 from fdtasil.rollouts.episodes import Episodes
 
 __all__ = [
@@ -135,7 +135,9 @@ class DAgger:
             if share == 0:
                 return Decision(own, None)
             answers = expert.ask(observations, "act")
-            return Decision(mix(answers, own, share, noise), answers)
+            # Where the expert has no answer, the student acts alone.
+            theirs = np.where(has_none(answers)[:, None], own, answers)
+            return Decision(mix(theirs, own, share, noise), answers)
 
         return act
 
@@ -185,7 +187,8 @@ class Dart:
         def act(observations: np.ndarray, noise: Sequence[np.random.Generator]) -> Decision:
             answers = expert.ask(observations, "act")
             normal = np.stack([random.standard_normal(len(spread)) for random in noise])
-            return Decision((answers + normal @ spread).astype(np.float32), answers)
+            noisy = (answers + normal @ spread).astype(np.float32)
+            return Decision(noisy, answers, silent_rows(answers))
 
         return act
 
@@ -197,8 +200,9 @@ class Dart:
     def _spread(self, situation: Situation, student: Policy) -> np.ndarray:
         """Return the (m, m) square root of the noise's covariance."""
         episodes = situation.record(_expert_acts(situation.expert), self.extra)
-        states = episodes.observations[episodes.valid]
-        errors = (student(states) - episodes.actions[episodes.valid]).astype(np.float64)
+        answered = episodes.answered
+        states = episodes.observations[answered]
+        errors = (student(states) - episodes.expert_actions[answered]).astype(np.float64)
         covariance = errors.T @ errors / len(errors)
         if self.alpha > 0 and np.trace(covariance) > 0:
             covariance *= self.alpha / (episodes.valid.shape[1] * np.trace(covariance))
@@ -236,7 +240,7 @@ class NoisyExpert:
             for row, random in enumerate(noise):
                 if numbers.setdefault(random, len(numbers)) % 2 == 0:
                     actions[row] += spread * random.standard_normal(len(spread))
-            return Decision(actions, answers)
+            return Decision(actions, answers, silent_rows(answers))
 
         return act
 
@@ -248,7 +252,7 @@ class NoisyExpert:
 def _expert_acts(expert: Expert) -> Behaviour:
     def act(observations: np.ndarray, noise: Sequence[np.random.Generator]) -> Decision:
         answers = expert.ask(observations, "act")
-        return Decision(answers, answers)
+        return Decision(answers, answers, silent_rows(answers))
 
     return act
 

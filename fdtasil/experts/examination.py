@@ -11,7 +11,7 @@ from fdtasil.experts.expert import Expert
 from fdtasil.experts.gate import GATE_STATES, Finding, admit_expert, examine_expert
 from fdtasil.experts.load import ExpertLike, load_expert
 from fdtasil.progress import Progress
-from fdtasil.rollouts.behaviours import follow, random_behaviour
+from fdtasil.rollouts.behaviours import follow_answers, random_behaviour
 from fdtasil.rollouts.environments import EnvironmentPool, resolve_horizon
 from fdtasil.rollouts.episodes import Episodes, check_episodes
 from fdtasil.rollouts.rollout import first_observations, rollout
@@ -61,7 +61,7 @@ def examine(
     """
     check_first(expert, pool, starts, force=force, rows=rows, largest=largest)
     with progress.bar("expert", "step", len(starts) * horizon) as bar:
-        behaviour = follow(expert.policy("evaluate"))
+        behaviour = follow_answers(expert.policy("evaluate"))
         episodes = rollout(behaviour, pool, starts, horizon, on_step=bar.move)
     check_episodes(episodes, pool.name)
     admit_expert(expert, episodes.spread(GATE_STATES), pool.boxes, force=force)
@@ -148,7 +148,7 @@ def look_closely(
     opening = Finding("opening", f"{expert.name}: {sizes[0]} -> {sizes[1]} numbers", None)
     starts = episode_seeds(seed, "evaluation", 0, episodes)
     try:
-        own = rollout(follow(expert.policy("act")), pool, starts, length)
+        own = rollout(follow_answers(expert.policy("act")), pool, starts, length)
     except ExpertError as error:
         return Looked([opening, Finding("answers", error.found, error)], expert)
     chance = None

@@ -10,8 +10,9 @@ import torch
 
 from fdtasil.errors import ExpertError, SettingError, in_one_line
 from fdtasil.experts.sb3.trust import Trust
+from fdtasil.experts.silence import Silence
 from fdtasil.experts.worker_process import as_array
-from fdtasil.rollouts.behaviours import Policy
+from fdtasil.rollouts.behaviours import Policy, has_none
 
 __all__ = ["Expert", "Hints", "Purpose", "RaisedElsewhere"]
 
@@ -80,7 +81,8 @@ class Expert:
         multiply_adds: At most how many a row takes, where the file says it; see `cost.py`.
         chunk: Rows asked at once.
         workers: Who answer chunks side by side instead of `answer`, or None; copies share them.
-        queries: Rows answered so far, by purpose.
+        queries: Rows asked so far, by purpose.
+        silence: Where it had no answer; copies share it as they share the queries.
 
     Example:
         >>> import numpy as np
@@ -101,6 +103,7 @@ class Expert:
     source: str | None = None
     columns: tuple[int, ...] | None = None
     multiply_adds: int | None = None
+    silence: Silence = field(default_factory=Silence)
 
     def ask(self, observations: np.ndarray, purpose: Purpose) -> np.ndarray:
         """Answer a batch and count its rows.
@@ -111,10 +114,12 @@ class Expert:
             purpose: The entry of the ledger that the rows are counted under.
 
         Returns:
-            (B, m) float32 actions, in an array of their own.
+            (B, m) float32 actions, in an array of their own. A row of NaN is no answer: the
+            expert's own is one, or it raised about that row and not about others.
 
         Raises:
-            ExpertError: If the expert raises, or its answer has another shape or is not finite.
+            ExpertError: If the expert raises whatever it is asked about, or its answer has
+                another shape or is infinite.
             SettingError: If the observations are not finite numbers, or have another shape.
         """
         rows = self._rows(observations)
@@ -122,8 +127,14 @@ class Expert:
         starts = range(0, max(len(rows), 1), self.chunk)
         chunks = [rows[start : start + self.chunk] for start in starts]
         if self.workers is not None:
-            return np.concatenate(self.workers.each(self._ask_chunk, chunks))
-        return np.concatenate([self._ask_chunk(chunk, self.answer) for chunk in chunks])
+            answers = np.concatenate(self.workers.each(self._ask_chunk, chunks))
+        else:
+            answers = np.concatenate([self._ask_chunk(chunk, self.answer) for chunk in chunks])
+        none = has_none(answers)
+        if none.any():
+            answers[none] = np.nan
+            self.silence.rows[purpose] += int(none.sum())
+        return answers
 
     def count(self, rows: int, purpose: Purpose) -> None:
         """Count rows that are answered, here or by a copy of what answers."""
@@ -154,6 +165,61 @@ class Expert:
         return rows
 
     def _ask_chunk(self, rows: np.ndarray, ask: Policy) -> np.ndarray:
+        try:
+            answers = self._checked(rows, ask)
+        except _Raised as raised:
+            answers = self._ask_alone(rows, ask, raised)
+        none = has_none(answers)
+        if none.all() and len(none):
+            self._check_control(ask, _not_finite(self, len(rows), none))
+        elif self.silence.answered is None:
+            self.silence.answered = rows[~none][:1].copy()
+        return answers
+
+    def _ask_alone(self, rows: np.ndarray, ask: Policy, raised: "_Raised") -> np.ndarray:
+        """Ask a batch that raised again, row by row, to find those that it belongs to.
+
+        Raises:
+            ExpertError: If it belongs to none of them, or to all that it may be asked about.
+        """
+        if raised.everywhere:
+            raise raised.error
+        found: list[np.ndarray | None] = [None]
+        if len(rows) > 1:
+            found = [self._asked_alone(row[None], ask) for row in rows]
+        answered = [answer for answer in found if answer is not None]
+        if len(answered) == len(rows):
+            raise raised.error  # of the batch, not of a row
+        if not answered:
+            self._check_control(ask, raised.error)
+        self.silence.reason = raised.text
+        size = self.action_size or (answered[0].shape[1] if answered else 1)
+        none = np.full((1, size), np.nan, np.float32)
+        return np.concatenate([none if answer is None else answer for answer in found])
+
+    def _asked_alone(self, row: np.ndarray, ask: Policy) -> np.ndarray | None:
+        try:
+            return self._checked(row, ask)
+        except _Raised:
+            return None
+
+    def _check_control(self, ask: Policy, error: ExpertError) -> None:
+        """Raise an error, unless the expert still answers what it has answered before."""
+        control = self.silence.answered
+        if control is None:
+            raise error
+        self.count(1, "check")
+        answer = self._asked_alone(control, ask)
+        if answer is None or has_none(answer).any():
+            raise error
+
+    def _checked(self, rows: np.ndarray, ask: Policy) -> np.ndarray:
+        """Return the answers to a batch as they are; rows of NaN are none.
+
+        Raises:
+            _Raised: What the expert raised.
+            ExpertError: If the answers are none in shape, or infinite.
+        """
         expected = f"({len(rows)}, {self.action_size or 'm'}) finite numbers"
         try:
             # Each call gets a copy and its answer is copied: experts that write into their input
@@ -162,30 +228,59 @@ class Expert:
         except ExpertError:
             raise
         except Exception as error:
-            kind = error.kind if isinstance(error, RaisedElsewhere) else type(error).__name__
-            raise ExpertError(
-                f"{self.name} raised {kind} on {len(rows)} observations: {in_one_line(error)}",
-                expected,
-                "call it on such a batch on its own; experts answer (B, n) with (B, m)",
-            ) from error
+            raise _Raised.of(self.name, len(rows), expected, error) from error
         if answer.ndim != 2 or len(answer) != len(rows) or not self._has_action_size(answer):
             raise ExpertError(
                 f"{self.name} answered {rows.shape} observations with shape {answer.shape}",
                 expected,
                 "return one row of actions for each row of observations",
             )
-        bad = ~np.isfinite(answer).all(axis=1)
-        if bad.any():
-            raise ExpertError(
-                f"{self.name} is not finite on {bad.sum()} of {len(rows)} observations, "
-                f"the first of them row {int(bad.argmax())}",
-                expected,
-                "check its weights, and its answer to the observations that it is given",
-            )
+        infinite = np.isinf(answer).any(axis=1)
+        if infinite.any():
+            raise _not_finite(self, len(rows), infinite)
         return answer
 
     def _has_action_size(self, answer: np.ndarray) -> bool:
         return self.action_size is None or answer.shape[1] == self.action_size
+
+
+class _Raised(Exception):
+    """What an expert raised about a batch, as the error that it is if it belongs to no row.
+
+    Args:
+        error: The error.
+        text: What was raised, in one line.
+        everywhere: Whether it says nothing of single rows.
+    """
+
+    def __init__(self, error: ExpertError, text: str, *, everywhere: bool) -> None:
+        super().__init__(text)
+        self.error, self.text, self.everywhere = error, text, everywhere
+
+    @classmethod
+    def of(cls, name: str, rows: int, expected: str, error: Exception) -> "_Raised":
+        """Return what an exception on so many rows is."""
+        kind = error.kind if isinstance(error, RaisedElsewhere) else type(error).__name__
+        said = in_one_line(error)
+        whole = ExpertError(
+            f"{name} raised {kind} on {rows} observations: {said}",
+            expected,
+            "call it on such a batch on its own; experts answer (B, n) with (B, m)",
+        )
+        whole.__cause__ = error
+        return cls(whole, f"{kind}: {said}", everywhere=kind in _NOT_OF_A_ROW)
+
+
+_NOT_OF_A_ROW = {"MemoryError", "TimeoutError", "RecursionError"}
+
+
+def _not_finite(expert: Expert, rows: int, bad: np.ndarray) -> ExpertError:
+    return ExpertError(
+        f"{expert.name} is not finite on {bad.sum()} of {rows} observations, "
+        f"the first of them row {int(bad.argmax())}",
+        f"({rows}, {expert.action_size or 'm'}) finite numbers",
+        "check its weights, and its answer to the observations that it is given",
+    )
 
 
 def _converted(observations: object) -> np.ndarray:

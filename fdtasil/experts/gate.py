@@ -8,6 +8,8 @@ import numpy as np
 
 from fdtasil.errors import ExpertError, FdtasilError, warn
 from fdtasil.experts.expert import Expert
+from fdtasil.experts.silence import check_answered
+from fdtasil.rollouts.behaviours import has_none
 from fdtasil.rollouts.environments import Boxes
 
 __all__ = [
@@ -92,8 +94,20 @@ def _examine(
         return [Finding("answers", error.found, error)]
     # The first query may start workers, and any may meet a busy machine: the quickest counts.
     announce(float(np.diff(times).min()) / len(observations))
+    none = has_none(answers) | has_none(again) | has_none(alone)
+    measured = f"{answers.shape[1]} finite numbers for each observation"
+    if none.any():
+        measured += f", none at {none.sum()} of {len(none)}"
+        try:
+            check_answered(
+                expert.name, expert.silence, int(none.sum()), len(none), "visited states"
+            )
+        except ExpertError as error:
+            return [Finding("answers", error.found, error)]
+        parts = (observations, answers, again, alone)
+        observations, answers, again, alone = (part[~none] for part in parts)
     probe = _Answers(expert, observations, answers, boxes)
-    found = Finding("answers", f"{answers.shape[1]} finite numbers for each observation", None)
+    found = Finding("answers", measured, None)
     return [
         found,
         probe.same(again, "determinism", "asked twice", _STOCHASTIC),
@@ -147,7 +161,11 @@ def compare_again(expert: Expert, observations: np.ndarray, answers: np.ndarray)
     except ExpertError as error:
         warn(f"asked again at the end of the run, the expert failed: {error.found}")
         return
-    difference = float(np.abs(now - before).max())
+    none = has_none(now)
+    if none.all():
+        warn("asked again at the end of the run, the expert has no answer where it had one")
+        return
+    difference = float(np.abs(now - before)[~none].max())
     spread = max(1.0, float(np.abs(answers).max()))
     if difference <= _SAME * spread:
         return
@@ -219,7 +237,8 @@ class _Answers:
         except ExpertError as error:
             # Named so that nothing can force it: the probes would meet it after hours.
             return Finding("answers", error.found, ExpertError(error.found, *advice))
-        difference = np.abs(answers - np.tile(self.answers, (repeats, 1))[:rows]).max(axis=1)
+        expected = np.tile(self.answers, (repeats, 1))[:rows]
+        difference = np.nan_to_num(np.abs(answers - expected).max(axis=1), nan=0.0)
         wrong = int((difference > _SAME * self._range()).sum())
         measured = f"{rows:,} rows at once: largest difference {difference.max():.1e}"
         if not wrong:

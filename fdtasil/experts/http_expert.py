@@ -9,7 +9,7 @@ import time
 from contextlib import suppress
 from http import HTTPStatus
 from types import TracebackType
-from typing import TypeGuard
+from typing import Any, TypeGuard
 from urllib.parse import SplitResult, urlsplit
 
 import numpy as np
@@ -250,7 +250,7 @@ class _Client:
                 f"check that this path takes {_REQUEST}, and what the server has logged",
             )
         try:
-            actions = np.asarray(json.loads(data)["actions"])
+            actions = np.asarray(_without_null(json.loads(data)["actions"]))
         except (ValueError, LookupError, TypeError, RecursionError):
             actions = None
         if actions is None or actions.dtype.kind not in "iuf":
@@ -260,6 +260,20 @@ class _Client:
                 "mend what the server answers",
             )
         return actions
+
+
+def _without_null(actions: Any) -> Any:
+    """Return rows of numbers with NaN in the place of null, which is no answer."""
+    if not isinstance(actions, list) or "null" not in json.dumps(actions):
+        return actions
+    size = max((len(row) for row in actions if isinstance(row, list)), default=1)
+    rows = ([None] * size if row is None else row for row in actions)
+    return [
+        [float("nan") if number is None else number for number in row]
+        if isinstance(row, list)
+        else row
+        for row in rows
+    ]
 
 
 def _status(response: http.client.HTTPResponse) -> str:

@@ -10,8 +10,10 @@ import numpy as np
 
 from fdtasil.errors import ExpertError, SettingError, warn
 from fdtasil.experts.expert import Expert, Purpose
+from fdtasil.experts.silence import check_answered
 from fdtasil.probes.derivatives import differentiate
 from fdtasil.probes.surroundings import Drawn, Surroundings
+from fdtasil.rollouts.behaviours import has_none
 
 __all__ = ["FROM_THE_START", "Answers", "Beginning", "ask_moved", "ask_probes"]
 
@@ -82,7 +84,9 @@ def ask_probes(
     beginning: Beginning = FROM_THE_START,
     asked: Callable[[Drawn], np.ndarray] | None = None,
 ) -> Answers:
-    """Ask the expert around each state.
+    """Ask the expert around each state; probes without an answer are left out.
+
+    A state has others of its probes twice then, and one without any answer is asked about itself.
 
     Args:
         expert: Who is asked; differentiated instead, if the stencil is exact.
@@ -93,7 +97,8 @@ def ask_probes(
         asked: Who answers instead of the expert, all at once; None for itself.
 
     Raises:
-        ExpertError: If the stencil is exact and the expert can't be differentiated.
+        ExpertError: If the stencil is exact and the expert can't be differentiated, or it has no
+            answer at most of the moved states.
         SettingError: If a step is lost in rounding, or the answers do not fit into memory.
     """
     probes, observations = around.probes, around.observations
@@ -109,7 +114,8 @@ def ask_probes(
         else:
             offsets = probes.stencil.offsets
             values = _ask_values(expert, observations, drawn, offsets, beginning)
-        return Answers(drawn.displacements, drawn.numbers, values, drawn.gains)
+        answers = Answers(drawn.displacements, drawn.numbers, values, drawn.gains)
+        return _without_silence(answers, expert, observations)
     except MemoryError as error:
         numbers = str(error).startswith(_NEEDED) and f": {error}"
         raise SettingError(
@@ -118,6 +124,46 @@ def ask_probes(
             "answers that do",
             "pass fewer probes: they teach alike",
         ) from error
+
+
+def _without_silence(answers: Answers, expert: Expert, observations: np.ndarray) -> Answers:
+    """Replace probes without an answer by others of their state."""
+    silent = np.asarray(np.isnan(answers.values).any(axis=3))
+    if not silent.any():
+        return answers
+    silence, count = expert.silence, int(silent.sum())
+    check_answered(expert.name, silence, count, silent.size, "moved states")
+    none = np.asarray(silent.any(axis=2))
+    numbers, values, left = answers.numbers.copy(), answers.values.copy(), none.copy()
+    for turn in range(1, none.shape[1]):  # the next one that has an answer
+        others = np.roll(none, -turn, axis=1)
+        found = left & ~others
+        numbers[found] = np.roll(answers.numbers, -turn, axis=1)[found]
+        values[found] = np.roll(answers.values, -turn, axis=1)[found]
+        left &= ~found
+    whole = Answers(answers.displacements, numbers, values, answers.gains)
+    return _asked_about_themselves(whole, np.asarray(left.all(axis=1)), expert, observations)
+
+
+def _asked_about_themselves(
+    answers: Answers, states: np.ndarray, expert: Expert, observations: np.ndarray
+) -> Answers:
+    """Let some states, (N,) bool, have probes that move nothing, which teach nothing new."""
+    if not states.any():
+        return answers
+    said = expert.ask(observations[states], "probe")
+    none = int(has_none(said).sum())
+    if none:  # it had an answer when the state was labelled
+        check_answered(expert.name, expert.silence, len(said), none, "states asked about again")
+    numbers, values = answers.numbers.copy(), answers.values.copy()
+    numbers[states], values[states] = len(answers.displacements), said[:, None, None, :]
+    still = np.zeros((1, answers.displacements.shape[1]), np.float32)
+    return Answers(
+        np.concatenate([answers.displacements, still]),
+        numbers,
+        values,
+        np.append(answers.gains, 1.0),
+    )
 
 
 def ask_moved(expert: Expert, points: np.ndarray, purpose: Purpose) -> np.ndarray:

@@ -6,7 +6,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from fdtasil.errors import warn
+from fdtasil.errors import ExpertError, warn
 from fdtasil.experts.expert import Expert
 from fdtasil.files.plain import from_plain, to_plain
 from fdtasil.probes.answers import ask_moved
@@ -54,6 +54,7 @@ _ROUGH_RADIUS = 0.5
 # is steep for the scale that it is probed at: a swing-up that ends in a stiff balance has 2.4,
 # networks that walk 0.5 to 1. Differences alone then count more than the actions do.
 _STEEP = 1.5
+_RAYS = 4  # that are answered throughout, at least
 _NOISY_FROM = 4.0**-6  # smallest radius with a derivative; float32 rounding stays below it
 _NOISY_SHARE = 0.3  # of noise in a difference; above it a given radius is warned of
 WIDE = (0.2, 2.0)
@@ -82,6 +83,8 @@ class Calibration:
         change: Root mean square change of an action at each radius.
         radii: The radii, ascending.
         queries: Rows asked.
+        no_answer: Radius, and share of the states moved so far where the expert has no answer;
+            empty where it has one everywhere.
     """
 
     regime: Literal["smooth", "noisy", "steps"]
@@ -93,6 +96,7 @@ class Calibration:
     radii: tuple[float, ...]
     queries: int
     match: Match | None = None
+    no_answer: tuple[tuple[float, float], ...] = ()
 
     def complete(self, probes: Probes) -> Probes:
         """Return the source with what it leaves open filled in; warn of a radius that misleads."""
@@ -180,6 +184,10 @@ def calibrate(
     centres = expert.ask(observations[rows], "calibrate").astype(np.float64)
     answers = ask_moved(expert, points.reshape(-1, len(scale)), "calibrate")
     values = answers.reshape(rays, len(radii), 2, -1).astype(np.float64)
+    shares = _no_answer(values, radii)
+    if np.isnan(values).any() or np.isnan(centres).any():
+        values, centres = _answered(values, centres, expert)
+        radii = radii[: values.shape[1]]
     secants = (values[:, :, 0] - values[:, :, 1]) / (2 * radii[None, :, None])
     similarity = _similarity(secants[:, 1:], secants[:, :-1])
     second = values[:, 0, 0] + values[:, 0, 1] - 2 * centres
@@ -197,6 +205,36 @@ def calibrate(
         tuple(radii.tolist()),
         ladder.queries,
         "both" if steep else None,
+        shares,
+    )
+
+
+def _no_answer(values: np.ndarray, radii: np.ndarray) -> tuple[tuple[float, float], ...]:
+    """Return radii and shares without an answer of (rays, radii, 2, m) values."""
+    shares = np.isnan(values).any(axis=3).mean(axis=(0, 2))
+    return tuple(zip(radii.tolist(), shares.tolist(), strict=True)) if shares.any() else ()
+
+
+def _answered(
+    values: np.ndarray, centres: np.ndarray, expert: Expert
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return values and centres of the rays that are answered throughout, as far as some are.
+
+    Raises:
+        ExpertError: If there are none even near the states.
+    """
+    centred = np.isfinite(centres).all(axis=1, keepdims=True)
+    heard = np.asarray(np.isfinite(values).all(axis=(2, 3)) & centred)
+    for farthest in range(values.shape[1], 1, -1):
+        rays = heard[:, :farthest].all(axis=1)
+        if rays.sum() >= _RAYS:
+            return values[rays, :farthest], centres[rays]
+    near = int((~heard[:, :2]).any(axis=1).sum())
+    raise ExpertError(
+        f"{expert.name} has no answer near {near} of {len(heard)} states; it said "
+        f"{expert.silence.reason}",
+        f"answers around {_RAYS} of them at least",
+        "look at what it makes of a state that is moved a little, or pass probes=0",
     )
 
 

@@ -11,7 +11,7 @@ from fdtasil.experts.expert import Expert
 from fdtasil.files.plain import from_plain, to_plain
 from fdtasil.probes.scales import measure_scales
 from fdtasil.progress import Progress
-from fdtasil.rollouts.behaviours import Policy, follow, random_behaviour
+from fdtasil.rollouts.behaviours import Behaviour, random_behaviour
 from fdtasil.rollouts.environments import EnvironmentPool
 from fdtasil.rollouts.episodes import Episodes
 from fdtasil.rollouts.rollout import rollout
@@ -90,7 +90,7 @@ class Evaluation:
 
 
 def evaluate_pair(
-    student: Policy,
+    student: Behaviour,
     expert: Expert,
     expert_episodes: Episodes,
     pool: EnvironmentPool,
@@ -101,7 +101,7 @@ def evaluate_pair(
     """Run a policy from the starts of the expert's episodes, and compare.
 
     Args:
-        student: Any policy.
+        student: Who acts.
         expert: Answers on the student's states, counted under "evaluate".
         expert_episodes: (E, T) the expert's own, already recorded.
         pool: The environment.
@@ -111,7 +111,7 @@ def evaluate_pair(
     """
     seeds = [int(s) for s in expert_episodes.seeds]
     with progress.bar("evaluation", "step", len(seeds) * horizon) as bar:
-        student_episodes = rollout(follow(student), pool, seeds, horizon, on_step=bar.move)
+        student_episodes = rollout(student, pool, seeds, horizon, on_step=bar.move)
     reference = _reference_return(expert_episodes, pool, seeds, horizon, seed)
     ours, theirs = student_episodes.returns, expert_episodes.returns
     meaningful = float(theirs.mean()) > reference
@@ -127,6 +127,7 @@ def evaluate_pair(
     visited = student_episodes.observations[student_episodes.valid]
     own = student_episodes.actions[student_episodes.valid]
     distance = np.linalg.norm(own - expert.ask(visited, "evaluate"), axis=1)
+    distance = distance[~np.isnan(distance)]  # where the expert has an answer
     return Evaluation(
         episodes=len(seeds),
         horizon=horizon,
@@ -137,7 +138,7 @@ def evaluate_pair(
         ci95=_interval(ours - reference, theirs - reference, seed) if meaningful else None,
         survival=float(1 - student_episodes.terminated.mean()),
         expert_survival=float(1 - expert_episodes.terminated.mean()),
-        action_error=float(distance.mean()),
+        action_error=float(distance.mean()) if len(distance) else float("nan"),
         imitation_gap=_imitation_gap(student_episodes, expert_episodes),
         expert_returns=tuple(theirs.tolist()),
         student_returns=tuple(ours.tolist()),

@@ -7,7 +7,16 @@ import numpy as np
 
 from fdtasil.rollouts.environments import EnvironmentPool
 
-__all__ = ["Behaviour", "Decision", "Policy", "follow"]
+__all__ = [
+    "Behaviour",
+    "Decision",
+    "Policy",
+    "follow",
+    "follow_answers",
+    "has_none",
+    "random_behaviour",
+    "silent_rows",
+]
 
 Policy = Callable[[np.ndarray], np.ndarray]
 """(B, n) float32 raw observations -> (B, m) float32 actions in environment units."""
@@ -18,11 +27,15 @@ class Decision(NamedTuple):
 
     Attributes:
         action: (B, m) float32, sent to the environment after clipping to its bounds.
-        expert_action: (B, m) float32 unclipped expert answer at the same states, or None.
+        expert_action: (B, m) float32 unclipped expert answer at the same states, or None; a row
+            of NaN where it has none.
+        silent: (B,) bool, where who acts has no answer, and the last action is held; None for
+            nowhere.
     """
 
     action: np.ndarray
     expert_action: np.ndarray | None
+    silent: np.ndarray | None = None
 
 
 Behaviour = Callable[[np.ndarray, Sequence[np.random.Generator]], Decision]
@@ -32,6 +45,27 @@ Behaviour = Callable[[np.ndarray, Sequence[np.random.Generator]], Decision]
 def follow(policy: Policy) -> Behaviour:
     """Return the behaviour that does what `policy` says."""
     return lambda observations, _: Decision(policy(observations), None)
+
+
+def follow_answers(policy: Policy) -> Behaviour:
+    """Return the behaviour that does what `policy` says; rows of NaN are no answer."""
+
+    def act(observations: np.ndarray, _: Sequence[np.random.Generator]) -> Decision:
+        answers = policy(observations)
+        return Decision(answers, None, silent_rows(answers))
+
+    return act
+
+
+def silent_rows(answers: np.ndarray) -> np.ndarray | None:
+    """Return (B,) bool, the rows of (B, m) answers that are none; None where all are answers."""
+    none = has_none(answers)
+    return none if none.any() else None
+
+
+def has_none(answers: np.ndarray) -> np.ndarray:
+    """Return (B,) bool, the rows of (B, m) answers that are none."""
+    return np.asarray(np.isnan(answers).any(axis=1))
 
 
 def random_behaviour(pool: EnvironmentPool) -> Behaviour:

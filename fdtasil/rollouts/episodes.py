@@ -26,6 +26,8 @@ class Episodes:
         clipped_actions: Steps at which an action had to be clipped.
         physics_resets: (E,) number of steps of each episode at which the simulator silently put
             itself back to its start.
+        refused: (E, T) bool, where the expert was asked and had no answer.
+        given_up: (E,) bool, whether the episode was ended because who acts had none for long.
     """
 
     observations: np.ndarray
@@ -38,6 +40,8 @@ class Episodes:
     terminated: np.ndarray
     clipped_actions: int
     physics_resets: np.ndarray
+    refused: np.ndarray
+    given_up: np.ndarray
 
     @property
     def lengths(self) -> np.ndarray:

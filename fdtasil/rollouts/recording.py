@@ -11,12 +11,15 @@ import gymnasium
 import numpy as np
 
 from fdtasil.errors import EnvironmentFault, first_line, warn
-from fdtasil.rollouts.behaviours import Decision
+from fdtasil.rollouts.behaviours import Decision, silent_rows
 from fdtasil.rollouts.environments import EnvironmentPool
 from fdtasil.rollouts.episodes import Episodes
 from fdtasil.rollouts.narrowing import Narrowing
 
-__all__ = ["Recording"]
+__all__ = ["HOLD", "Recording"]
+
+HOLD = 10
+"""Steps in a row that an action is held for where who acts has no answer; then it ends."""
 
 
 class Recording:
@@ -36,6 +39,10 @@ class Recording:
         self.actions = np.zeros((episodes, horizon, m), np.float32)
         self.expert_actions = np.zeros((episodes, horizon, m), np.float32)
         self.answered = np.zeros((episodes, horizon), bool)
+        self.refused = np.zeros((episodes, horizon), bool)
+        self.given_up = np.zeros(episodes, bool)
+        self._held = np.zeros(episodes, np.int64)  # steps in a row
+        self._silent_at = np.full(episodes, -2)
         self.rewards = np.zeros((episodes, horizon))
         self.valid = np.zeros((episodes, horizon), bool)
         self.terminated = np.zeros(episodes, bool)
@@ -129,6 +136,25 @@ class Recording:
                 raise self._fault(episode, step, problem, f"{size} finite numbers, as promised")
         raise AssertionError("good observations make a good batch")
 
+    def hold(
+        self, alive: Sequence[int], step: int, decision: Decision
+    ) -> tuple[Decision, np.ndarray]:
+        """Let those who have no answer go on as they did in the last step, for a while.
+
+        Returns:
+            The decision with actions everywhere, and (B,) bool, whose episodes go on.
+        """
+        assert decision.silent is not None, "asked only where somebody is silent"
+        numbers = np.asarray(alive)
+        before = np.where(self._silent_at[numbers] == step - 1, self._held[numbers], 0)
+        self._held[numbers] = np.where(decision.silent, before + 1, 0)
+        self._silent_at[numbers[decision.silent]] = step
+        self.given_up[numbers] = self._held[numbers] > HOLD
+        # At the start there is no last action: the one nearest to none.
+        last = self.actions[numbers, step - 1] if step else np.zeros_like(decision.action)
+        actions = np.where(decision.silent[:, None], last, decision.action)
+        return decision._replace(action=actions), ~self.given_up[numbers]
+
     def decide(
         self, alive: list[int], step: int, observations: np.ndarray, decision: Decision
     ) -> np.ndarray:
@@ -151,8 +177,10 @@ class Recording:
         self.actions[alive, step] = decision.action
         self.valid[alive, step] = True
         if decision.expert_action is not None:
+            none = silent_rows(decision.expert_action)
+            self.answered[alive, step] = True if none is None else ~none
+            self.refused[alive, step] = False if none is None else none
             self.expert_actions[alive, step] = decision.expert_action
-            self.answered[alive, step] = True
         allowed, clipped = self._bounds.put_inside(decision.action)
         self.clipped_actions += clipped
         return allowed
@@ -181,6 +209,8 @@ class Recording:
             self.terminated,
             self.clipped_actions,
             self.physics_resets,
+            self.refused,
+            self.given_up,
         )
 
     def _where(self, episode: int, step: int | None) -> str:

@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping, Sequence
 import gymnasium
 import numpy as np
 
-from fdtasil.rollouts.behaviours import Behaviour
+from fdtasil.rollouts.behaviours import Behaviour, Decision
 from fdtasil.rollouts.recording import Recording
 
 __all__ = ["step_together"]
@@ -33,6 +33,13 @@ def step_together(
     batch = record.observed([record.reset(environments[e], e) for e in alive], alive, None)
     for step in range(horizon):
         decision = behaviour(batch, [noise[e] for e in alive])
+        if decision.silent is not None:
+            decision, heard = record.hold(alive, step, decision)
+            if not heard.all():
+                alive = [episode for row, episode in enumerate(alive) if heard[row]]
+                batch, decision = batch[heard], _rows_of(decision, heard)
+            if not alive:
+                break
         allowed = record.decide(alive, step, batch, decision)
         after, going = [], np.ones(len(alive), bool)
         for row, episode in enumerate(alive):
@@ -46,3 +53,9 @@ def step_together(
         alive = [episode for row, episode in enumerate(alive) if going[row]]
         if not alive:
             break
+
+
+def _rows_of(decision: Decision, kept: np.ndarray) -> Decision:
+    """Return some rows of a decision that is one everywhere."""
+    answers = decision.expert_action
+    return Decision(decision.action[kept], None if answers is None else answers[kept])

@@ -11,39 +11,79 @@ from fdtasil.errors import SettingError
 __all__ = ["Account", "check_account"]
 
 
+class _Tally:
+    """Rows by purpose, over interruptions, each counted once.
+
+    Args:
+        rows: Those of this process; only the expert writes them, and they only grow.
+    """
+
+    def __init__(self, rows: Mapping[str, int]) -> None:
+        self._rows = rows
+        self._earlier: Mapping[str, int] = {}
+        self._before: Mapping[str, int] = {}  # the rows, when the earlier ones were taken up
+        self._repeated: Counter[str] = Counter()
+
+    @property
+    def counted(self) -> Counter[str]:
+        counted = Counter(self._earlier)
+        counted.update(self._rows)
+        counted.subtract(self._before)
+        counted.subtract(self._repeated)
+        return counted
+
+    @property
+    def again(self) -> int:
+        return sum(self._before.values()) + self._repeated.total()
+
+    def to_json(self) -> dict[str, int]:
+        return {purpose: rows for purpose, rows in self.counted.items() if rows}
+
+    def take_up(self, earlier: Mapping[str, int]) -> None:
+        self._earlier, self._before = earlier, dict(self._rows)
+        self._repeated.clear()  # all rows of this process are
+
+    @contextmanager
+    def repeating(self) -> Iterator[None]:
+        before = Counter(self._rows)
+        yield
+        self._repeated.update(Counter(self._rows) - before)
+
+
 class Account:
     """The account of a run, which every checkpoint keeps.
 
-    The ledger only grows, and only the expert writes it. What a run has spent is what its
-    interrupted part had spent, and what the ledger has grown by since that was taken up.
+    What a run has spent is what its interrupted part had spent, and what has come since that was
+    taken up.
 
     Args:
-        ledger: Rows that the expert has answered in this process, by purpose.
+        ledger: Rows that the expert was asked for in this process, by purpose.
+        silence: Those of them that had no answer.
         notes: The library's warnings in this process; grows by itself.
     """
 
-    def __init__(self, ledger: Mapping[str, int], notes: Sequence[str]) -> None:
-        self._ledger, self._notes = ledger, notes
-        self._earlier: dict[str, Any] = {"queries": {}, "again": 0, "notes": [], "seconds": 0.0}
-        self._before: Mapping[str, int] = {}  # the ledger, when that was taken up
-        self._heard = 0  # notes of this process, when that was taken up
-        self._repeated: Counter[str] = Counter()
+    def __init__(
+        self, ledger: Mapping[str, int], silence: Mapping[str, int], notes: Sequence[str]
+    ) -> None:
+        self._asked, self._silent, self._notes = _Tally(ledger), _Tally(silence), notes
+        self._earlier: dict[str, Any] = {"again": 0, "notes": [], "seconds": 0.0}
+        self._heard = 0  # notes of this process, when the earlier ones were taken up
         self._began = time.perf_counter()
 
     @property
     def queries(self) -> Counter[str]:
         """Rows by purpose, each counted once."""
-        spent = Counter(self._earlier["queries"])
-        spent.update(self._ledger)
-        spent.subtract(self._before)
-        spent.subtract(self._repeated)
-        return spent
+        return self._asked.counted
+
+    @property
+    def silent(self) -> Counter[str]:
+        """Rows without an answer by purpose, each counted once."""
+        return self._silent.counted
 
     @property
     def again(self) -> int:
         """Rows that were asked again after an interruption; they are counted nowhere else."""
-        repeated = sum(self._before.values()) + self._repeated.total()
-        return self._earlier["again"] + repeated
+        return self._earlier["again"] + self._asked.again
 
     @property
     def notes(self) -> list[str]:
@@ -63,9 +103,9 @@ class Account:
 
     def to_json(self) -> dict[str, Any]:
         """Return what a checkpoint keeps."""
-        queries = {purpose: rows for purpose, rows in self.queries.items() if rows}
         return {
-            "queries": queries,
+            "queries": self._asked.to_json(),
+            "silent": self._silent.to_json(),
             "again": self.again,
             "notes": self.notes,
             "seconds": self.seconds,
@@ -73,17 +113,17 @@ class Account:
 
     def take_up(self, earlier: dict[str, Any]) -> None:
         """Go on from a checkpoint; what this process asked before, the interrupted one had too."""
-        self._earlier, self._before = earlier, dict(self._ledger)
+        self._earlier = earlier
+        self._asked.take_up(earlier["queries"])
+        self._silent.take_up(earlier.get("silent", {}))  # older versions knew of none
         self._heard = len(self._notes)
-        self._repeated.clear()  # the whole ledger is
         self.start_clock()
 
     @contextmanager
     def asked_before(self) -> Iterator[None]:
         """Count what is asked inside the block as asked again: the interrupted part counted it."""
-        before = Counter(self._ledger)
-        yield
-        self._repeated.update(Counter(self._ledger) - before)
+        with self._asked.repeating(), self._silent.repeating():
+            yield
 
     def check_budget(self, rows: int, most: int | None) -> None:
         """Refuse to ask beyond the budget: early ends make a resampling source ask more often.
@@ -110,10 +150,13 @@ def check_account(earlier: object) -> None:
     """
     if not isinstance(earlier, dict):
         raise TypeError("an account that is none")
-    queries, notes = earlier["queries"], earlier["notes"]
+    queries, silent, notes = earlier["queries"], earlier.get("silent", {}), earlier["notes"]
     good = (
         isinstance(queries, dict)
-        and all(type(rows) is int for rows in (*queries.values(), earlier["again"]))
+        and isinstance(silent, dict)
+        and all(
+            type(rows) is int for rows in (*queries.values(), *silent.values(), earlier["again"])
+        )
         and isinstance(notes, list)
         and all(isinstance(note, str) for note in notes)
         and type(earlier["seconds"]) in (int, float)

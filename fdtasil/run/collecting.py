@@ -80,6 +80,7 @@ class Collecting:
         counts["physics_resets"] += int(episodes.physics_resets.sum())
         counts["terminated_episodes"] += int(episodes.terminated.sum())
         counts["replaced_episodes"] += replaced
+        counts["given_up_episodes"] += int(episodes.given_up.sum())
         dataset = Dataset(states, None, None, boxes.low, boxes.high, self.pool.name)
         return Collected(dataset, first + len(episodes.valid), counts)
 
@@ -96,7 +97,8 @@ class Collecting:
         chosen = np.linspace(0, len(states) - 1, min(len(states), _ASKED_AGAIN)).astype(int)
         rows, stored = states.observations[chosen], states.actions[chosen]
         answers = self.expert.ask(rows, "check")
-        apart = np.abs(answers - stored).max(axis=1)
+        # A planner that found nothing this time is no other expert.
+        apart = np.nan_to_num(np.abs(answers - stored).max(axis=1), nan=0.0)
         bound = _SAME * float(np.abs(states.actions).max())
         if (apart <= bound).all():
             return

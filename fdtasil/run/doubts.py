@@ -1,5 +1,7 @@
 """What demonstrations lack, said before a student is trained on them."""
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from fdtasil.demonstrations.states import Demonstrations
@@ -9,7 +11,7 @@ from fdtasil.rollouts.episodes import Episodes
 from fdtasil.rollouts.survivors import SURVIVORS
 from fdtasil.run.lesson import Lesson
 
-__all__ = ["warn_of_falls", "warn_of_still_coordinates"]
+__all__ = ["warn_of_falls", "warn_of_silence", "warn_of_still_coordinates"]
 
 _FEW = 5  # demonstrations, of which each counts
 _USUALLY = 0.75  # share of the expert's episodes that it survives
@@ -33,6 +35,24 @@ def warn_of_falls(states: Demonstrations, expert: Episodes, keep: str) -> None:
             f"{', '.join(map(str, fallen))} of {horizon} steps, and the expert lasts in "
             f'{lasts:.0%} of its episodes: keep="survivors" records others in their place'
         )
+
+
+def warn_of_silence(shares: Mapping[str, float], reason: str, given_up: int) -> None:
+    """Warn of states where the expert had no answer.
+
+    Args:
+        shares: By purpose, of the rows asked, where some had none.
+        reason: What it said instead, the last time.
+        given_up: Episodes that ended for it.
+    """
+    if not shares:
+        return
+    where = ", ".join(f"{name} {share:.2g}" for name, share in shares.items())
+    ended = f"; {given_up} episodes ended for it" if given_up else ""
+    warn(
+        f"the expert had no answer to some rows (shares: {where}), which are left out{ended}; the "
+        f"last time it said {reason}"
+    )
 
 
 def warn_of_still_coordinates(lesson: Lesson, expert: Episodes) -> None:

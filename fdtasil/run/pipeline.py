@@ -19,6 +19,7 @@ from fdtasil.probes.spread import SpreadLike
 from fdtasil.progress import Progress
 from fdtasil.results.distilled import Distilled, write_run
 from fdtasil.results.evaluation import Evaluation, evaluate_pair
+from fdtasil.rollouts.behaviours import follow, follow_answers
 from fdtasil.rollouts.environments import EnvironmentLike, EnvironmentPool, resolve_horizon
 from fdtasil.rollouts.episodes import Episodes
 from fdtasil.run.account import Account
@@ -27,11 +28,12 @@ from fdtasil.run.asking import Asking
 from fdtasil.run.checkpoints import Checkpoints
 from fdtasil.run.collecting import Collecting
 from fdtasil.run.configuration import Configuration
+from fdtasil.run.doubts import warn_of_silence
 from fdtasil.run.events import Callback, Event, tell_all
 from fdtasil.run.folder import asked_anew, open_run_folder
 from fdtasil.run.interrupts import heard_interrupts
 from fdtasil.run.lesson import Lesson
-from fdtasil.run.report import config_of, report_of
+from fdtasil.run.report import config_of, no_answer, report_of
 from fdtasil.run.rounds import Rounds
 from fdtasil.run.subject import Subject, open_subject
 from fdtasil.run.training import Training
@@ -183,7 +185,9 @@ def distill(
         ):
             if folder and kept.finished and resume is not None:
                 return Distilled.load(folder, student_obs)
-            account = Account(subject.expert.queries if subject.expert else {}, notes)
+            expert = subject.expert
+            asked, silent = (expert.queries, expert.silence.rows) if expert else ({}, {})
+            account = Account(asked, silent, notes)
             checkpoints = Checkpoints(kept, account, Asking(run, subject.expert, account))
             training = Training(run, chosen, checkpoints, bars, interrupts, told)
             rounds = Rounds(run, student_obs, _collecting(run, subject, bars), training)
@@ -247,7 +251,7 @@ def evaluate(
         seen = judged.columns if student_obs is None else student_obs
         view = View.of(seen, theirs.observations[theirs.valid][:256])
         answer = view.policy(sized(judged, view.size, m).policy("evaluate"))
-        return evaluate_pair(answer, black_box, theirs, pool, length, seed, bars)
+        return evaluate_pair(follow_answers(answer), black_box, theirs, pool, length, seed, bars)
 
 
 def _folder_of(out: str | Path | None, resume: str | Path | None) -> Path | None:
@@ -284,9 +288,9 @@ def _complete(
         lesson, trained = rounds.complete(given, theirs)
         seconds, student, evaluation = checkpoints.account.seconds, trained.student, None
         if subject.expert is not None and subject.pool is not None and theirs is not None:
-            policy, last = lesson.view.policy(student.act), trained.history[-1]
+            last = trained.history[-1]
             evaluation = evaluate_pair(
-                policy,
+                follow(lesson.view.policy(student.act)),
                 subject.expert,
                 theirs,
                 subject.pool,
@@ -297,6 +301,9 @@ def _complete(
             about = int(last["round"]), trained.steps, last
             rounds.training.callback(Event("evaluation", *about, student, evaluation))
         _ask_again(run, subject.expert, theirs, lesson)
+        if subject.expert is not None:
+            shares, ended = no_answer(checkpoints.account), lesson.collected.counts
+            warn_of_silence(shares, subject.expert.silence.reason, ended["given_up_episodes"])
     report = report_of(
         run,
         evaluation,

@@ -6,6 +6,7 @@ from importlib.metadata import version
 from typing import Any
 
 from fdtasil.results.evaluation import Evaluation
+from fdtasil.run.account import Account
 from fdtasil.run.checkpoints import Checkpoints
 from fdtasil.run.configuration import Configuration
 from fdtasil.run.lesson import Lesson
@@ -25,6 +26,12 @@ def versions() -> dict[str, str]:
 def config_of(run: Configuration) -> dict[str, Any]:
     """Return what `config.json` holds, as plain JSON values."""
     return {**run.to_json(), "versions": versions()}
+
+
+def no_answer(account: Account) -> dict[str, float]:
+    """Return the share of the rows asked that had no answer, by purpose, where some had none."""
+    asked = account.queries
+    return {name: rows / asked[name] for name, rows in account.silent.items() if rows > 0}
 
 
 def report_of(
@@ -56,7 +63,13 @@ def report_of(
     before = run.predicted_queries()
     chosen = {purpose: before[purpose] for purpose in ("calibrate", "check")}
     predicted = replace(run, probes=source).predicted_queries() | chosen
-    counts = ("clipped_actions", "physics_resets", "terminated_episodes", "replaced_episodes")
+    counts = (
+        "clipped_actions",
+        "physics_resets",
+        "terminated_episodes",
+        "replaced_episodes",
+        "given_up_episodes",
+    )
     return {
         "expert": {
             "path": run.expert,
@@ -72,6 +85,7 @@ def report_of(
         "evaluation": evaluation.to_json() if evaluation else None,
         "queries": {name: account.queries[name] for name in predicted},
         "predicted_queries": predicted,
+        "no_answer": no_answer(account),
         "rows_asked_again_after_resuming": account.again,
         "states": len(lesson.dataset.demonstrations),
         "frozen_coordinates": int((~lesson.scales.live).sum()),

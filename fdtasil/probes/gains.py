@@ -1,0 +1,190 @@
+"""The Jacobian of any expert by central differences, with an estimate of its error."""
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from fdtasil.checks import check_count, spelt
+from fdtasil.errors import SettingError
+from fdtasil.experts.expert import Expert
+from fdtasil.experts.load import ExpertLike, load_expert
+from fdtasil.probes.scales import measure_scales
+
+__all__ = ["Gains", "gains"]
+
+_RUNGS = 4.0 ** np.arange(-9, 1)  # of the ladder, in units of the scale, ascending
+_RAYS = 64  # one coordinate of one state each
+_WINDOW = 2  # rungs below the best one that the error's law is fitted to; above, curves bend
+# Between derivatives at the radius and at half of it lie 5 parts of the noise's square. What is more
+# than that may be truncation, of which it is 9/16, or noise that steps hide from the ladder, of
+# which it is 5: the geometric mean is at most 1.7 times off.
+_BEYOND = (16 / 9 / 5) ** 0.5
+_RATIO = 4.0  # of a rung to the one below it
+
+
+@dataclass(frozen=True)
+class Gains:
+    """Jacobians of an expert, K(x) of a controller.
+
+    Attributes:
+        jacobian: (N, m, n) derivatives of each action by each coordinate of the observation.
+        error: (m, n) the standard error that is expected of each of them, over the states.
+        radius: Half the distance of a difference, in units of `scale`.
+        scale: (n,) unit of each coordinate.
+        noise_floor: (m,) root mean square error of an action, as differences show it.
+        queries: Rows asked.
+    """
+
+    jacobian: np.ndarray
+    error: np.ndarray
+    radius: float
+    scale: np.ndarray
+    noise_floor: np.ndarray
+    queries: int
+
+    @property
+    def relative_error(self) -> float:
+        """Norm of the errors as a share of the derivatives' norm, coordinates in their units."""
+        sizes = np.sqrt(np.nanmean(self.jacobian**2, axis=0))
+        return float(np.linalg.norm(self.error * self.scale) / np.linalg.norm(sizes * self.scale))
+
+
+def gains(
+    expert: ExpertLike,
+    states: np.ndarray,
+    *,
+    scale: np.ndarray | None = None,
+    seed: int = 0,
+) -> Gains:
+    """Return the Jacobian of an expert at states, without its help.
+
+    The distance is found first, on a ladder of them: the error of a central difference is
+    noise / radius at near ones, and curvature * radius^2 at far ones. States without an answer
+    around them have NaN.
+
+    Args:
+        expert: As in `load_expert`.
+        states: (N, n) observations.
+        scale: (n,) by how much each coordinate usually differs; measured over the states if left
+            out, and 1 where they are a single one or do not differ.
+        seed: Of the ladder's states and coordinates.
+
+    Returns:
+        Jacobians and their errors, from 4 n rows for each state and about 1,300 for the ladder.
+
+    Raises:
+        SettingError: If states or scale can't be used.
+        ExpertError: If the expert can't be asked.
+
+    Example:
+        >>> import numpy as np
+        >>> found = gains(lambda rows: np.sin(rows[:, :1]), np.zeros((1, 2)))
+        >>> found.jacobian.round(3), found.relative_error < 1e-3
+        (array([[[1., 0.]]]), True)
+    """
+    rows = _checked(states)
+    units = _units(rows, scale)
+    asked = load_expert(expert, rows.shape[1])
+    random = np.random.default_rng(check_count("seed", seed, 0))
+    noise, curvature = _law(asked, rows, units, random)
+    radius = _best_radius(noise, curvature)
+    jacobian, near = (_jacobian(asked, rows, units * reach) for reach in (radius, radius / 2))
+    # On average over the states: what is left of single ones is more chance than error.
+    spread = (noise / radius)[:, None] / units
+    apart = np.nanmean((jacobian - near) ** 2, axis=0)
+    beyond = np.maximum(apart - 5 * spread**2, 0) * _BEYOND
+    return Gains(
+        jacobian,
+        np.sqrt(beyond + spread**2),
+        radius,
+        units,
+        noise * 2**0.5,
+        asked.queries["probe"],
+    )
+
+
+def _checked(states: object) -> np.ndarray:
+    try:
+        rows = np.asarray(states, np.float32)
+        if rows.ndim != 2 or not rows.size or not np.isfinite(rows).all():
+            raise ValueError
+    except (TypeError, ValueError):
+        raise SettingError(
+            f"{spelt('states', states)[:80]}",
+            "(N, n) finite observations",
+            "pass for example result.dataset.demonstrations.observations[:10]",
+        ) from None
+    return rows
+
+
+def _units(rows: np.ndarray, scale: np.ndarray | None) -> np.ndarray:
+    if scale is None:
+        scales = measure_scales(rows)
+        return np.where(scales.live, scales.deviation, 1.0)
+    units = np.asarray(scale, np.float64)
+    if units.shape != rows.shape[1:] or not (np.isfinite(units) & (units > 0)).all():
+        found = f"scale of shape {units.shape}, from {units.min(initial=0):g}"
+        raise SettingError(found, f"({rows.shape[1]},) positive numbers", "leave it out")
+    return units
+
+
+def _law(
+    expert: Expert, rows: np.ndarray, units: np.ndarray, random: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return (m,) a and b of the error of a derivative, a / radius and b * radius^2.
+
+    Derivatives at a radius and at a quarter of it differ by the errors of both.
+    """
+    from scipy.optimize import nnls  # loads for a moment, and few need it
+
+    states = rows[random.integers(len(rows), size=_RAYS)]
+    axes = random.integers(rows.shape[1], size=_RAYS)
+    steps = np.zeros_like(states, np.float64)
+    steps[np.arange(_RAYS), axes] = units[axes]
+    slopes = np.stack([_slope(expert, states, steps * rung) / rung for rung in _RUNGS])
+    apart = np.nanmean(np.diff(slopes, axis=0) ** 2, axis=1)  # (rungs - 1, m)
+    sizes = np.nanmean(slopes[1:] ** 2 + slopes[:-1] ** 2, axis=1)
+    wide = _RUNGS[1:]
+    law = np.stack([(1 + _RATIO**2) / wide**2, (1 - _RATIO**-2) ** 2 * wide**4], axis=1)
+    noise, curvature = np.zeros((2, apart.shape[1]))
+    for action, (squares, size) in enumerate(zip(apart.T, sizes.T, strict=True)):
+        told = size > 0  # steps smaller than those of the expert say nothing
+        if not told.any():
+            continue
+        best = int(np.where(told, squares / np.where(told, size, 1), np.inf).argmin())
+        window = np.arange(max(0, best - _WINDOW), min(len(squares), best + 2))
+        window = window[squares[window] > 0]
+        if not len(window):  # it is linear
+            continue
+        design = law[window] / squares[window, None]
+        lengths = np.linalg.norm(design, axis=0)  # the columns lie twenty powers of ten apart
+        fitted, _ = nnls(design / lengths, np.ones(len(design)))
+        noise[action], curvature[action] = np.sqrt(fitted / lengths)
+    return noise, curvature
+
+
+def _best_radius(noise: np.ndarray, curvature: np.ndarray) -> float:
+    """Return where the errors of all actions together are smallest, within the ladder."""
+    a, b = float((noise**2).sum()), float((curvature**2).sum())
+    if b == 0:
+        return float(_RUNGS[-1])
+    return float(np.clip((a / (2 * b)) ** (1 / 6), _RUNGS[1], _RUNGS[-1]))
+
+
+def _jacobian(expert: Expert, rows: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """Return (N, m, n) central differences along each coordinate."""
+    count, n = rows.shape
+    states, moved = np.repeat(rows, n, axis=0), np.tile(np.diag(steps), (count, 1))
+    slopes = _slope(expert, states, moved) / steps[np.tile(np.arange(n), count), None]
+    return slopes.reshape(count, n, -1).transpose(0, 2, 1)
+
+
+def _slope(expert: Expert, states: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """Return (R, m) changes for each whole step, over the distance that float32 really moves."""
+    ahead, behind = (states + sign * steps for sign in (1, -1))
+    ahead, behind = ahead.astype(np.float32), behind.astype(np.float32)
+    lengths = np.linalg.norm(ahead.astype(np.float64) - behind, axis=1)
+    shares = lengths / np.linalg.norm(steps, axis=1)
+    answers = expert.ask(np.concatenate([ahead, behind]), "probe").astype(np.float64)
+    with np.errstate(divide="ignore", invalid="ignore"):  # a step that float32 rounds away
+        return (answers[: len(states)] - answers[len(states) :]) / shares[:, None]

@@ -1,0 +1,91 @@
+"""The Jacobian of any expert by differences, beside the analytic one, and its own error."""
+
+import numpy as np
+import pytest
+
+from fdtasil import gains
+from fdtasil.errors import ExpertError, SettingError
+
+N, M, HIDDEN = 6, 3, 64
+WEIGHTS = [
+    np.random.default_rng(1).standard_normal(shape) / shape[0] ** 0.5
+    for shape in ((N, HIDDEN), (HIDDEN, HIDDEN), (HIDDEN, M))
+]
+SCALE = np.array([1, 0.1, 5, 1, 2, 0.01])
+STATES = np.random.default_rng(0).standard_normal((40, N)) * SCALE + [0, 3, 0, 0, 10, 0]
+
+
+def network(rows):
+    first, second, last = (weights.astype(np.float32) for weights in WEIGHTS)
+    return np.tanh(np.tanh(rows @ first) @ second) @ last
+
+
+def analytic(rows):
+    first, second, last = WEIGHTS
+    inner = np.tanh(rows @ first)
+    outer = np.tanh(inner @ second)
+    left = np.einsum("ni,bi,ij->bnj", first, 1 - inner**2, second)
+    return np.einsum("bnj,bj,jm->bmn", left, 1 - outer**2, last)
+
+
+def noisy(sigma):
+    random = np.random.default_rng(5)
+    return lambda rows: network(rows) + sigma * random.standard_normal((len(rows), M))
+
+
+EXPERTS = {
+    "float32": (lambda: network, 1e-3),
+    "noise of 0.001": (lambda: noisy(1e-3), 0.12),
+    "noise of 0.01": (lambda: noisy(1e-2), 0.4),
+    "steps of 1/64": (lambda: lambda rows: np.round(64 * network(rows)) / 64, 0.25),
+}
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+@pytest.mark.parametrize(("make", "bound"), EXPERTS.values(), ids=EXPERTS)
+def test_the_error_is_small_and_known_within_a_factor_of_two(make, bound, seed):
+    found = gains(make(), STATES, seed=seed)
+    exact = analytic(STATES.astype(np.float32).astype(float))
+    error = np.linalg.norm((found.jacobian - exact) * found.scale)
+    error /= np.linalg.norm(exact * found.scale)
+    assert error < bound
+    assert 0.5 < found.relative_error / error < 2
+    assert found.queries == 2 * 10 * 64 + 4 * N * len(STATES)
+
+
+def test_the_noise_floor_is_the_noise():
+    found = gains(noisy(1e-2), STATES)
+    assert found.noise_floor == pytest.approx(np.full(M, 1e-2), rel=0.4)
+
+
+def test_a_linear_expert_is_exact_and_a_single_state_is_enough():
+    gain = np.random.default_rng(2).standard_normal((2, 4)).astype(np.float32)
+    found = gains(lambda rows: rows @ gain.T, np.zeros((1, 4)))
+    assert found.jacobian[0] == pytest.approx(gain, abs=1e-5)
+    constant = gains(lambda rows: rows[:, :1] * 0 + 1, np.zeros((1, 4)))
+    assert (constant.jacobian == 0).all()
+
+
+def test_a_state_without_an_answer_beside_it_has_none():
+    def limited(rows):
+        answers = rows[:, :2].copy()
+        answers[rows[:, 0] > 1] = np.nan
+        return answers
+
+    found = gains(limited, np.array([[0.0, 0, 0], [1.0, 0, 0], [0.5, 0.1, 1]]))
+    assert np.isfinite(found.jacobian[[0, 2]]).all()
+    assert np.isnan(found.jacobian[1, :, 0]).all()
+    assert found.jacobian[1, :, 1:] == pytest.approx(np.array([[0, 0], [1, 0]]), abs=1e-4)
+    assert np.isfinite(found.relative_error)
+
+
+@pytest.mark.parametrize(
+    "states", [[], [[np.nan]], np.zeros(3), "states", None, [[1, 2], [3]]], ids=str
+)
+def test_states_that_can_not_be_used_are_refused(states):
+    with pytest.raises(SettingError, match="finite observations"):
+        gains(network, states)
+    with pytest.raises(SettingError, match="6,\\) positive numbers"):
+        gains(network, STATES, scale=[1, 2])
+    with pytest.raises(ExpertError, match="raised"):
+        gains(lambda rows: rows @ np.zeros((3, 1)), STATES)
