@@ -34,6 +34,7 @@ if TYPE_CHECKING:
     from fdtasil.errors import FdtasilError, FdtasilWarning
     from fdtasil.experts.expert import Expert
     from fdtasil.experts.load import load_expert
+    from fdtasil.probes.gains import gains
     from fdtasil.probes.source import Probes
     from fdtasil.results.distilled import Distilled
     from fdtasil.results.evaluation import Evaluation

@@ -2,7 +2,9 @@
 
 import numpy as np
 import pytest
+from conftest import QUICK, TOY
 
+import fdtasil
 from fdtasil import gains
 from fdtasil.errors import ExpertError, SettingError
 
@@ -89,3 +91,47 @@ def test_states_that_can_not_be_used_are_refused(states):
         gains(network, STATES, scale=[1, 2])
     with pytest.raises(ExpertError, match="raised"):
         gains(lambda rows: rows @ np.zeros((3, 1)), STATES)
+
+
+LINEAR = np.random.default_rng(3).standard_normal((2, 5)).astype(np.float32) / 4
+
+
+def sensitive(rows, sign=1.0):
+    """Return actions and, as a solver with exact sensitivities would, their derivatives."""
+    angles = rows @ LINEAR.T
+    slopes = np.cos(angles)[:, :, None] * LINEAR
+    return np.sin(angles), sign * slopes
+
+
+class Solver:
+    def predict(self, observation):
+        return sensitive(observation)[0], None
+
+    def jacobian(self, observations):
+        return sensitive(observations)[1]
+
+
+@pytest.mark.usefixtures("no_pictures")
+@pytest.mark.parametrize("expert", [sensitive, Solver()], ids=["function", "object"])
+def test_derivatives_that_an_expert_gives_are_the_analytic_reference(expert):
+    result = fdtasil.distill(expert, TOY, probes="jacobian", progress=False, **QUICK)
+    answers, states = result.dataset.answers, result.dataset.demonstrations.observations
+    along = answers.displacements[answers.numbers]
+    exact = np.einsum("bmn,bkn->bkm", sensitive(states)[1], along)
+    assert answers.values[:, :, 0] == pytest.approx(exact, abs=1e-5)
+    assert np.isfinite(result.evaluation.normalized_return)
+
+
+@pytest.mark.usefixtures("nothing_is_trained")
+def test_derivatives_of_something_else_are_named():
+    run = {**QUICK, "probes": "jacobian", "progress": False}
+    with pytest.raises(ExpertError, match="not those of its actions: of action"):
+        fdtasil.distill(lambda rows: sensitive(rows, sign=-1), TOY, **run)
+    with pytest.raises(ExpertError, match="can't be differentiated: it returns its actions alone"):
+        fdtasil.distill(lambda rows: sensitive(rows)[0], TOY, **run)
+    with pytest.raises(ExpertError, match=r"derivatives of shape \(\d+, 5, 2\)"):
+        fdtasil.distill(
+            lambda rows: (sensitive(rows)[0], sensitive(rows)[1].transpose(0, 2, 1)), TOY, **run
+        )
+    with pytest.raises(ExpertError, match="differentiated twice"):
+        fdtasil.distill(sensitive, TOY, **{**run, "fit": fdtasil.Fit(steps=40, order=2)})

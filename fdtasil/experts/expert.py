@@ -76,6 +76,8 @@ class Expert:
         sha256: Of the file it came from, or None.
         source: What to call it in reports, its path or address; None where it has none.
         columns: The coordinates that a student's file says it sees, or None.
+        jacobian: (B, n) observations -> (B, m, n) derivatives of the actions, where the expert
+            may give them itself; or None.
         module: The same function as a differentiable torch module, or None; only the analytic
             reference (`probes="jacobian"`) uses it.
         multiply_adds: At most how many a row takes, where the file says it; see `cost.py`.
@@ -104,6 +106,7 @@ class Expert:
     columns: tuple[int, ...] | None = None
     multiply_adds: int | None = None
     silence: Silence = field(default_factory=Silence)
+    jacobian: Callable[[np.ndarray], np.ndarray] | None = None
 
     def ask(self, observations: np.ndarray, purpose: Purpose) -> np.ndarray:
         """Answer a batch and count its rows.

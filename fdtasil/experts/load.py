@@ -20,6 +20,7 @@ from fdtasil.experts.http_expert import is_http_url, open_http
 from fdtasil.experts.hub import fetch, is_hub_uri
 from fdtasil.experts.modules import ask_as_it_is, open_module
 from fdtasil.experts.onnx_expert import open_onnx
+from fdtasil.experts.own_jacobian import own_jacobian
 from fdtasil.experts.predicting import open_predictor
 from fdtasil.experts.sb3.agent import read_agent
 from fdtasil.experts.sb3.trust import Trust
@@ -61,9 +62,11 @@ def load_expert(
     Args:
         source: An ONNX path, the path of a stable-baselines3 zip, either of them on the Hugging
             Face hub (`hf://org/repo/file[@revision]`), a torch module, an object with
-            stable-baselines3's `predict`, a function (B, n) -> (B, m), `http://host:port/path`
+            stable-baselines3's `predict`, a function (B, n) -> (B, m), which may return its
+            (B, m, n) derivatives beside them, `http://host:port/path`
             (`POST {"observations": [[...]]}`, answered by `{"actions": [[...]]}`), or an `Expert`,
-            of which a copy is returned.
+            of which a copy is returned. An object or a function with a method `jacobian` gives its
+            derivatives by that.
         observation_size: n, where it is known; checked against the expert.
         action_size: m, where it is known; chooses among the outputs of an ONNX file.
         output: Name of the ONNX output that holds the actions.
@@ -232,7 +235,7 @@ def _from_predictor(source: Predictor, hints: Hints) -> Expert:
 
 def _from_function(function: Callable[[np.ndarray], np.ndarray], hints: Hints) -> Expert:
     name = getattr(function, "__name__", type(function).__name__)
-    return Expert(function, f"the function {name}")
+    return Expert(function, f"the function {name}", jacobian=own_jacobian(function))
 
 
 def _is_path(source: object) -> bool:

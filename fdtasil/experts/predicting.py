@@ -9,6 +9,7 @@ import numpy as np
 
 from fdtasil.errors import ExpertError, warn
 from fdtasil.experts.expert import Expert
+from fdtasil.experts.own_jacobian import own_jacobian
 
 __all__ = ["open_predictor"]
 
@@ -30,7 +31,8 @@ def open_predictor(source: Any) -> Expert:
     # scikit-learn's predict takes the batch alone; stable-baselines3's is stochastic by default.
     parameters = inspect.signature(source.predict).parameters
     options = {"deterministic": True} if "deterministic" in parameters else {}
-    return Expert(_Predicts(_asked(source), name, options, _statistics(source)), name)
+    answer = _Predicts(_asked(source), name, options, _statistics(source))
+    return Expert(answer, name, jacobian=own_jacobian(source))
 
 
 @dataclass(frozen=True)

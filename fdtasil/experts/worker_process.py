@@ -57,7 +57,7 @@ def as_array(answer: Any) -> Any:
 
     found = answer
     if isinstance(answer, tuple) and len(answer) == 2 and np.ndim(answer[0]) == 2:
-        if answer[1] is not None:
+        if answer[1] is not None and np.ndim(answer[1]) != 3:  # derivatives, (B, m, n)
             raise TypeError("it returned a second value beside the actions, such as a state")
         found = answer[0]
     if hasattr(found, "detach"):  # torch is not imported where the expert does not need it

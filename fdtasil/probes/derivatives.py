@@ -1,16 +1,20 @@
-"""The analytic reference: exact directional derivatives of an expert that is a torch module."""
+"""The analytic reference: exact directional derivatives, of a torch module or the expert's own."""
 
 from collections.abc import Callable
 
 import numpy as np
 import torch
 
-from fdtasil.errors import ExpertError
+from fdtasil.errors import ExpertError, in_one_line
 from fdtasil.experts.expert import Expert
+from fdtasil.probes.gains import gains
 
 __all__ = ["differentiate"]
 
 _STATES = 64  # differentiated at once
+_COMPARED = 4  # states at which an expert's own derivatives are compared with differences
+_APART = 3  # errors of a difference that they may lie apart, and
+_TOLERATED = 0.02  # of the derivatives' norm
 
 
 def differentiate(
@@ -23,7 +27,7 @@ def differentiate(
     """Differentiate the expert along directions.
 
     Args:
-        expert: A differentiable one.
+        expert: One that is a torch module, or gives its derivatives itself.
         observations: (N, n) float32 states.
         directions: (P, n) float32 bank.
         numbers: (N, k) rows of the bank, those of each state.
@@ -33,15 +37,12 @@ def differentiate(
         (N, k, order, m) float32 directional derivatives.
 
     Raises:
-        ExpertError: If the expert can't be differentiated.
+        ExpertError: If the expert can't be differentiated, or its own derivatives are not those
+            of its actions.
     """
     module = expert.module
     if module is None:
-        raise ExpertError(
-            f"{expert.name} can't be differentiated",
-            "a torch module, or an ONNX file made of the operators of an MLP",
-            'probe it instead: probes="basis" or probes=10',
-        )
+        return _given(expert, observations, directions, numbers, order)
     like = next(module.parameters(), torch.zeros(()))
     along = torch.func.vmap(_derivatives_along(module, order), in_dims=(None, 0))
     every = torch.func.vmap(along)
@@ -70,3 +71,78 @@ def _derivatives_along(
         return torch.stack(both[:2])
 
     return derivatives
+
+
+def _given(
+    expert: Expert,
+    observations: np.ndarray,
+    directions: np.ndarray,
+    numbers: np.ndarray,
+    order: int,
+) -> np.ndarray:
+    """Return the derivatives along directions, from those that the expert gives."""
+    probed = 'probe it instead: probes="basis" or probes=10'
+    if expert.jacobian is None or order > 1:
+        raise ExpertError(
+            f"{expert.name} can't be differentiated" + (" twice" if expert.jacobian else ""),
+            "a torch module, or an ONNX file made of the operators of an MLP"
+            + ("" if order > 1 else ", or a second value, its (B, m, n) derivatives"),
+            probed,
+        )
+    _compare(expert, observations)
+    parts = []
+    for start in range(0, len(observations), _STATES):
+        rows = slice(start, start + _STATES)
+        jacobians = _jacobians(expert, observations[rows])
+        moved = directions[numbers[rows]]
+        parts.append(np.einsum("bmn,bkn->bkm", jacobians, moved)[:, :, None])
+    return np.concatenate(parts).astype(np.float32)
+
+
+def _jacobians(expert: Expert, rows: np.ndarray) -> np.ndarray:
+    """Ask for the derivatives at some states, counted as rows of probes."""
+    assert expert.jacobian is not None
+    expert.count(len(rows), "probe")
+    expected = f"({len(rows)}, {expert.action_size or 'm'}, {rows.shape[1]}) finite derivatives"
+    try:
+        found = np.array(expert.jacobian(rows.copy()), np.float32)
+    except Exception as error:
+        raise ExpertError(
+            f"{expert.name} can't be differentiated: {in_one_line(error)}",
+            expected,
+            'probe it instead: probes="basis" or probes=10',
+        ) from error
+    right = found.ndim == 3 and found.shape[::2] == rows.shape
+    if not right or found.shape[1] != (expert.action_size or found.shape[1]):
+        raise ExpertError(
+            f"{expert.name} gives derivatives of shape {found.shape}",
+            expected,
+            "derivatives of actions (rows) by coordinates (columns), for each observation",
+        )
+    if not np.isfinite(found).all():
+        raise ExpertError(
+            f"{expert.name} gives derivatives that are not finite", expected, "look at them there"
+        )
+    return found
+
+
+def _compare(expert: Expert, observations: np.ndarray) -> None:
+    """Hold the expert's own derivatives against differences at a few states."""
+    chosen = np.linspace(0, len(observations) - 1, _COMPARED).astype(int)
+    rows = observations[chosen]
+    deviation = observations.std(axis=0, dtype=np.float64)
+    scale = np.where(deviation > 0, deviation, 1.0)
+    given, found = _jacobians(expert, rows), gains(expert, rows, scale=scale)
+    expert.queries["probe"] += found.queries
+    apart = np.sqrt(np.nanmean(((given - found.jacobian) * scale) ** 2, axis=0))
+    size = np.linalg.norm(np.sqrt(np.nanmean((found.jacobian * scale) ** 2, axis=0)))
+    bound = _APART * np.linalg.norm(found.error * scale) + _TOLERATED * size
+    if np.linalg.norm(apart) > bound:
+        action, column = np.unravel_index(apart.argmax(), apart.shape)
+        raise ExpertError(
+            f"{expert.name} gives derivatives that are not those of its actions: of action "
+            f"{action} by coordinate {column} it says {given[0, action, column]:.3g}, differences "
+            f"{found.jacobian[0, action, column]:.3g}",
+            "(B, m, n) derivatives of the actions by the raw observations",
+            'check signs, order and scaling, or probe it: probes="basis"',
+        )

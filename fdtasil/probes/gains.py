@@ -15,9 +15,9 @@ __all__ = ["Gains", "gains"]
 _RUNGS = 4.0 ** np.arange(-9, 1)  # of the ladder, in units of the scale, ascending
 _RAYS = 64  # one coordinate of one state each
 _WINDOW = 2  # rungs below the best one that the error's law is fitted to; above, curves bend
-# Between derivatives at the radius and at half of it lie 5 parts of the noise's square. What is more
-# than that may be truncation, of which it is 9/16, or noise that steps hide from the ladder, of
-# which it is 5: the geometric mean is at most 1.7 times off.
+# Between derivatives at the radius and at half of it lie 5 parts of the noise's square. What is
+# more than that may be truncation, of which it is 9/16, or noise that steps hide from the ladder,
+# of which it is 5: the geometric mean is at most 1.7 times off.
 _BEYOND = (16 / 9 / 5) ** 0.5
 _RATIO = 4.0  # of a rung to the one below it
 

@@ -1,0 +1,96 @@
+"""`fdtasil gains`: the Jacobian of an expert at states of its own episodes."""
+
+import io
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from fdtasil.checks import check_count
+from fdtasil.experts.examination import look_closely
+from fdtasil.experts.load import load_expert
+from fdtasil.files.storage import write_bytes
+from fdtasil.probes.gains import Gains, gains
+from fdtasil.probes.scales import measure_scales
+from fdtasil.rollouts.environments import EnvironmentPool
+from fdtasil.shell.call import opened
+from fdtasil.shell.command import EnvironmentId, ExpertPath, import_module_of
+
+__all__ = ["command"]
+
+
+def command(
+    expert: ExpertPath,
+    env: EnvironmentId,
+    /,
+    *,
+    states: int = 10,
+    out: Path | None = None,
+    output: str | None = None,
+    trust: Literal["pickle"] | None = None,
+    horizon: int | None = None,
+    seed: int = 0,
+) -> None:
+    """Find the Jacobian of any expert at states that it visits, with an estimate of the error.
+
+    Args:
+        expert: ONNX file, zip of a stable-baselines3 agent, or address.
+        env: Gymnasium id (module:Id imports the module first).
+        states: How many, evenly spread over an episode of the expert.
+        out: NumPy file (.npz) of states, Jacobians and errors.
+        output: Name of the ONNX output with the actions.
+        trust: "pickle" lets stable-baselines3 load what can't be read from a zip without running
+            code that is in it.
+        horizon: Steps after which the episode is cut; default: the environment's time limit.
+        seed: Of the episode.
+    """
+    check_count("states", states)
+    file = None if out is None else out.absolute()  # an environment may change the folder
+    import_module_of(env)
+    source = opened(expert, env, output=output, trust=trust)
+    assert source is not None
+    with EnvironmentPool(env) as pool:
+        looked = look_closely(source, pool, horizon, seed, 1, with_chance=False)
+        problem = next((f.problem for f in looked.findings if f.problem), None)
+        if looked.own is None:
+            assert problem is not None, "an expert that can't act has a finding that says why"
+            raise problem
+        sizes = pool.boxes.observation_size, pool.boxes.action_size
+        visited = looked.own.observations[looked.own.valid]
+        scales = measure_scales(visited)
+        scale = np.where(scales.live, scales.deviation, 1.0)
+        chosen = looked.own.spread(states)
+        found = gains(load_expert(source, *sizes), chosen, scale=scale, seed=seed)
+    print(_summary(found))
+    if file is not None:
+        write_bytes(file, _packed(chosen, found))
+        print(f"written: {file}")
+
+
+def _summary(found: Gains) -> str:
+    sizes = np.sqrt(np.nanmean((found.jacobian * found.scale) ** 2, axis=0))
+    rows = [
+        ("states", f"{len(found.jacobian)}, Jacobians of {sizes.shape[0]} x {sizes.shape[1]}"),
+        ("radius", f"{found.radius:.2g} standard deviations of each coordinate"),
+        ("error", f"{found.relative_error:.1%} of the Jacobian's norm, estimated"),
+        ("noise", f"{float(found.noise_floor.max()):.1e} in an action, at most"),
+        ("queries", f"{found.queries:,}"),
+    ]
+    strongest = np.argsort(sizes, axis=None)[::-1][:5]
+    for action, coordinate in zip(*np.unravel_index(strongest, sizes.shape), strict=True):
+        about = f"{sizes[action, coordinate]:.3g} for each standard deviation"
+        rows.append((f"action {action}", f"coordinate {coordinate}: {about}"))
+    return "\n".join(f"{name:10} {text}" for name, text in rows)
+
+
+def _packed(states: np.ndarray, found: Gains) -> bytes:
+    buffer = io.BytesIO()
+    np.savez(
+        buffer,
+        observations=states,
+        jacobian=found.jacobian,
+        error=found.error,
+        scale=found.scale,
+        radius=found.radius,
+    )
+    return buffer.getvalue()
