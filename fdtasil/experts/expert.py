@@ -30,6 +30,7 @@ class Hints:
         observation_size: n, or None.
         action_size: m, or None; chooses among the outputs of an ONNX file.
         output: Name of the ONNX output that holds the actions, or None.
+        inputs: What the inputs of an ONNX file are given, where it has several.
         trust: "pickle" where code inside a file may be run.
         timeout: Seconds that a batch may take, or None.
     """
@@ -39,6 +40,7 @@ class Hints:
     output: str | None = None
     trust: Trust = None
     timeout: float | None = None
+    inputs: Mapping[str, slice | np.ndarray] | None = None
 
 
 class RaisedElsewhere(Exception):

@@ -27,6 +27,7 @@ from fdtasil.experts.sb3.trust import Trust
 from fdtasil.experts.sizes import size_hint
 from fdtasil.experts.trial import vouch_for
 from fdtasil.experts.workers import BATCH, check_workers, with_processes, with_threads
+from fdtasil.files.onnx.binding import Inputs, check_inputs
 from fdtasil.rollouts.behaviours import Policy
 
 __all__ = ["KINDS", "ExpertLike", "Kind", "load_expert", "open_expert", "sized"]
@@ -51,6 +52,7 @@ def load_expert(
     action_size: int | None = None,
     *,
     output: str | None = None,
+    inputs: Inputs | None = None,
     batch: int | None = None,
     trust: Trust = None,
     workers: int = 0,
@@ -70,6 +72,9 @@ def load_expert(
         observation_size: n, where it is known; checked against the expert.
         action_size: m, where it is known; chooses among the outputs of an ONNX file.
         output: Name of the ONNX output that holds the actions.
+        inputs: What the inputs of an ONNX file are given, where it has several: a number or an
+            array always, or columns of the observation ("0:17"); one that is left out is given
+            the other columns.
         batch: Rows asked at once; 1 asks row by row. Left out, it is 1024, 64 over HTTP, 8
             with `workers`: equal batches give equal bytes, whatever the number of workers.
         trust: "pickle" lets stable-baselines3 load what can't be read from a zip without running
@@ -102,7 +107,9 @@ def load_expert(
         example = "leave it out, or write the name that a viewer of ONNX files shows"
         raise SettingError(spelt("output", output), "the name of an output", example)
     threads = check_flag("threads", threads)
-    kind, hints = _kind_of(source), Hints(observation_size, action_size, output, trust, timeout)
+    bound = None if inputs is None else check_inputs(inputs)
+    hints = Hints(observation_size, action_size, output, trust, timeout, bound)
+    kind = _kind_of(source)
     workers, timeout = check_workers(workers, threads, timeout, kind.remote)
     expert = sized(open_expert(source, hints), observation_size, action_size)
     if batch is None and workers and expert.chunk == CHUNK:

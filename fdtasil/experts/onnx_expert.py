@@ -11,6 +11,7 @@ from fdtasil.experts.expert import Expert, Hints
 from fdtasil.experts.sizes import size_hint
 from fdtasil.experts.trial import try_out
 from fdtasil.experts.twin import torch_twin
+from fdtasil.files.onnx.binding import bind
 from fdtasil.files.onnx.model import read_model
 from fdtasil.files.onnx.policy import OnnxPolicy, cannot_be_asked, open_policy
 
@@ -28,7 +29,8 @@ def open_onnx(source: str | Path, hints: Hints) -> Expert:
 
     Args:
         source: The file; weights may lie in a side file beside it.
-        hints: Sizes, where the file leaves them open, and the output that holds the actions.
+        hints: Sizes, where the file leaves them open, the output that holds the actions, and
+            what is given to which input.
 
     Returns:
         The expert. Its `module` is a torch twin where the graph is an MLP, else None.
@@ -38,8 +40,11 @@ def open_onnx(source: str | Path, hints: Hints) -> Expert:
     """
     path = Path(source)
     model, digest = read_model(path)
-    columns, data = _columns(model, path), model.SerializeToString()
+    columns = _columns(model, path)
     wanted = None if columns else hints.observation_size
+    if hints.inputs:
+        model = bind(model, hints.inputs, wanted)
+    data = model.SerializeToString()
     n = _declared_size(model)
     if n and wanted not in (None, n):
         raise ExpertError(

@@ -33,8 +33,9 @@ def distil(arguments: Arguments, *, progress: bool = True) -> Distilled:
     fit = {field.name: rest.pop(field.name) for field in fields(Fit)}
     said = {field.name: rest.pop(field.name) for field in fields(Mlp)}
     network = {name: value for name, value in said.items() if value is not None}
-    output, trust, formats = (rest.pop(name) for name in ("output", "trust", "log_formats"))
-    rest["expert"] = opened(rest["expert"], rest["env"], output=output, trust=trust)
+    output, inputs, trust = (rest.pop(name) for name in ("output", "inputs", "trust"))
+    formats = rest.pop("log_formats")
+    rest["expert"] = opened(rest["expert"], rest["env"], output=output, inputs=inputs, trust=trust)
     folder = Path(rest["out"] or rest["resume"] or ".")
     return distill(
         **rest,
@@ -46,17 +47,22 @@ def distil(arguments: Arguments, *, progress: bool = True) -> Distilled:
 
 
 def opened(
-    expert: str | None, env: str | None, *, output: str | None, trust: Any
+    expert: str | None,
+    env: str | None,
+    *,
+    output: str | None,
+    inputs: str | None,
+    trust: Any,
 ) -> ExpertLike | None:
     """Return an expert opened with options; as it is, where there are none.
 
     Raises:
         ExpertError: If it can't be opened.
     """
-    if expert is None or (output is None and trust is None):
+    if expert is None or (output is None and inputs is None and trust is None):
         return expert
     if env is None:
-        return load_expert(expert, output=output, trust=trust)
+        return load_expert(expert, output=output, inputs=inputs, trust=trust)
     with EnvironmentPool(env) as pool:  # whose sizes tell which output holds the actions
         sizes = pool.boxes.observation_size, pool.boxes.action_size
-    return load_expert(expert, *sizes, output=output, trust=trust)
+    return load_expert(expert, *sizes, output=output, inputs=inputs, trust=trust)

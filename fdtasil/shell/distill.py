@@ -202,7 +202,7 @@ command = as_command(
         ),
         Flags(Mlp, types={"hidden": tuple[int, ...]}, open=True),
         Flags(Fit, open=True),
-        Flags(load_expert, only=("output", "trust")),
+        Flags(load_expert, only=("output", "inputs", "trust"), types={"inputs": str | None}),
     ],
     {
         "log_formats": (

@@ -10,9 +10,11 @@ from fdtasil.shell.command import EnvironmentId, Flags, PolicyPath, as_command, 
 __all__ = ["command"]
 
 
-def _evaluate(expert: str, env: str, output: str | None, trust: Any, **arguments: Any) -> None:
+def _evaluate(
+    expert: str, env: str, output: str | None, inputs: str | None, trust: Any, **arguments: Any
+) -> None:
     import_module_of(env)
-    judge = opened(expert, env, output=output, trust=trust)
+    judge = opened(expert, env, output=output, inputs=inputs, trust=trust)
     assert judge is not None
     print(evaluate(expert=judge, env=env, **arguments))
 
@@ -30,7 +32,7 @@ command = as_command(
                 "student_obs": tuple[int, ...] | None,
             },
         ),
-        Flags(load_expert, only=("output", "trust")),
+        Flags(load_expert, only=("output", "inputs", "trust"), types={"inputs": str | None}),
     ],
     {},
 )

@@ -27,6 +27,7 @@ def command(
     states: int = 10,
     out: Path | None = None,
     output: str | None = None,
+    inputs: str | None = None,
     trust: Literal["pickle"] | None = None,
     horizon: int | None = None,
     seed: int = 0,
@@ -39,6 +40,8 @@ def command(
         states: How many, evenly spread over an episode of the expert.
         out: NumPy file (.npz) of states, Jacobians and errors.
         output: Name of the ONNX output with the actions.
+        inputs: What the inputs of an ONNX file are given, where it has several: a number always,
+            or columns, as in time_step=0,obs=0:17.
         trust: "pickle" lets stable-baselines3 load what can't be read from a zip without running
             code that is in it.
         horizon: Steps after which the episode is cut; default: the environment's time limit.
@@ -47,7 +50,7 @@ def command(
     check_count("states", states)
     file = None if out is None else out.absolute()  # an environment may change the folder
     import_module_of(env)
-    source = opened(expert, env, output=output, trust=trust)
+    source = opened(expert, env, output=output, inputs=inputs, trust=trust)
     assert source is not None
     with EnvironmentPool(env) as pool:
         looked = look_closely(source, pool, horizon, seed, 1, with_chance=False)

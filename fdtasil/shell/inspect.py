@@ -27,6 +27,7 @@ def command(
     /,
     *,
     output: str | None = None,
+    inputs: str | None = None,
     trust: Literal["pickle"] | None = None,
     episodes: int = 5,
     horizon: int | None = None,
@@ -39,6 +40,8 @@ def command(
         expert: ONNX file, zip of a stable-baselines3 agent, or address.
         env: Gymnasium id (module:Id imports the module first).
         output: Name of the ONNX output with the actions.
+        inputs: What the inputs of an ONNX file are given, where it has several: a number always,
+            or columns, as in time_step=0,obs=0:17.
         trust: "pickle" lets stable-baselines3 load what can't be read from a zip without running
             code that is in it.
         episodes: Episodes that the return is measured over.
@@ -50,7 +53,7 @@ def command(
     # Absolute from the beginning: an environment may change the working folder.
     file = None if picture is None else picture.absolute()
     import_module_of(env)
-    source = opened(expert, env, output=output, trust=trust)
+    source = opened(expert, env, output=output, inputs=inputs, trust=trust)
     assert source is not None
     with EnvironmentPool(env) as pool:
         looked = look_closely(source, pool, horizon, seed, episodes)

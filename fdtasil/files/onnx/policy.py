@@ -192,8 +192,12 @@ def _observation_size(session: "Session", name: str, wanted: int | None) -> int:
 def _several_inputs(session: "Session", name: str, described: str) -> ExpertError:
     """Say whether they are a memory, or parts of an observation."""
     inputs, outputs = session.get_inputs(), session.get_outputs()
-    shapes = [entry.shape for entry in outputs if len(entry.shape) == 3]
-    memory = any(_MEMORY.search(str(e.name)) or e.shape in shapes for e in inputs[1:])
+    # What goes in as it came out; a goal or a time goes in only.
+    widths = [entry.shape[-1:] for entry in outputs if entry.shape]
+    memory = any(
+        (_MEMORY.search(str(e.name)) or len(e.shape) == 3) and e.shape[-1:] in widths
+        for e in inputs[1:]
+    )
     found = f"{name} has {len(inputs)} inputs: {described}"
     if memory:
         return ExpertError(
@@ -201,18 +205,17 @@ def _several_inputs(session: "Session", name: str, described: str) -> ExpertErro
             "one input (batch, n); policies with memory can't be distilled",
             "choose a policy that depends on the observation only",
         )
-    given = [entry.shape[-1] if entry.shape else None for entry in inputs]
-    widths = [width for width in given if isinstance(width, int)]
-    if len(widths) < len(inputs):
-        step = "wrap it in a function on batches that gives each input its columns"
-        return ExpertError(found, "one input (batch, n) with the whole observation", step)
-    ends = np.cumsum([0, *widths])
-    parts = [f"rows[:, {ends[k]}:{ends[k + 1]}]" for k in range(len(inputs))]
-    fitting = [entry.name for entry in outputs if entry.type in _FLOATS] or [outputs[0].name]
+    start, parts = 0, []
+    for entry in inputs:
+        width = entry.shape[-1] if len(entry.shape) > 1 and entry.type in _FLOATS else None
+        wide = width if isinstance(width, int) else 0
+        parts.append(f'"{entry.name}": ' + (f'"{start}:{start + wide}"' if wide else "0.0"))
+        start += wide
+    written = shown(f"{{{', '.join(parts)}}}")
     return ExpertError(
         found,
-        "one input (batch, n) with the whole observation",
-        _wrapped(session, name, fitting[0], *parts),
+        "what each of them is given: columns of the observation, or a number always",
+        f"write for example load_expert(path, inputs={written}) (--inputs in a shell)",
     )
 
 

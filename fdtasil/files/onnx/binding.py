@@ -1,0 +1,210 @@
+"""Several inputs of an ONNX model made one: columns of the observation, or constants."""
+
+from collections.abc import Mapping
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from fdtasil.errors import SettingError, shown
+
+if TYPE_CHECKING:
+    import onnx
+
+__all__ = ["Inputs", "bind", "check_inputs"]
+
+Inputs = Mapping[str, Any] | str
+"""Name of an input -> a number or an array, which it is given always, or "0:17" (a slice as well),
+the columns of the observation that it is given; as a text "time_step=0,obs=0:17"."""
+
+_NAME = "fdtasil.observation"
+_EXAMPLE = 'write for example inputs={"time_step": 0.0, "obs": "0:17"}'
+
+
+def check_inputs(inputs: object) -> "dict[str, slice | np.ndarray]":
+    """Return inputs by name, each columns or a constant.
+
+    Raises:
+        SettingError: If they are something else.
+    """
+    expected = "names of inputs, each with a number, an array, or columns"
+    if isinstance(inputs, str):
+        inputs = _read(inputs)
+    if not isinstance(inputs, Mapping) or not all(isinstance(name, str) for name in inputs):
+        raise SettingError(f"inputs={shown(inputs)[:80]}", expected, _EXAMPLE)
+    found: dict[str, slice | np.ndarray] = {}
+    for name, given in inputs.items():
+        try:
+            found[name] = _columns(given) if isinstance(given, str | slice) else _constant(given)
+        except (TypeError, ValueError):
+            said = f"inputs: {shown(name)!r} is {shown(given)[:60]}"
+            raise SettingError(said, expected, _EXAMPLE) from None
+    return found
+
+
+def _read(text: str) -> Mapping[str, Any]:
+    try:
+        pairs = [part.split("=") for part in text.split(",")]
+        return {name.strip(): value if ":" in value else float(value) for name, value in pairs}
+    except ValueError:
+        found = f"inputs {shown(text)!r}"
+        raise SettingError(
+            found, "NAME=NUMBER or NAME=START:STOP", "time_step=0,obs=0:17"
+        ) from None
+
+
+def _columns(given: str | slice) -> slice:
+    if isinstance(given, str):
+        start, stop = (int(part) for part in given.split(":"))
+    else:
+        start, stop = int(given.start or 0), int(given.stop)
+        if given.step not in (None, 1):
+            raise ValueError
+    if not 0 <= start < stop:
+        raise ValueError
+    return slice(start, stop)
+
+
+def _constant(given: object) -> np.ndarray:
+    value = np.asarray(given, np.float64)
+    if not np.isfinite(value).all():
+        raise ValueError
+    return value
+
+
+def bind(
+    model: "onnx.ModelProto", inputs: "Mapping[str, slice | np.ndarray]", size: int | None
+) -> "onnx.ModelProto":
+    """Return a model of one input, the observation, that computes what the given one does.
+
+    Args:
+        model: With its weights loaded; not changed.
+        inputs: From `check_inputs`; one input may be left out, which is given the other columns.
+        size: n of the environment, or None.
+
+    Raises:
+        SettingError: If an input is not there, or is left out besides another one.
+    """
+    import onnx
+
+    bound = onnx.ModelProto()
+    bound.CopyFrom(model)
+    graph = bound.graph
+    constants = {tensor.name for tensor in graph.initializer}
+    entries = {entry.name: entry for entry in graph.input if entry.name not in constants}
+    parts = _complete(entries, inputs, size)
+    n = size or max(part.stop for part in parts.values() if isinstance(part, slice))
+    nodes: list[onnx.NodeProto] = []
+    for number, (name, part) in enumerate(parts.items()):
+        kind = entries[name].type.tensor_type
+        feed = _Feed(f"fdtasil.{number}", name, kind.elem_type)
+        if isinstance(part, slice):
+            feed.take(part)
+        else:
+            feed.hold(part, [dimension.dim_value for dimension in kind.shape.dim])
+        nodes += feed.nodes
+        graph.initializer.extend(feed.constants)
+    kept = list(graph.node)
+    del graph.node[:], graph.input[:]
+    graph.node.extend([*nodes, *kept])
+    graph.input.append(
+        onnx.helper.make_tensor_value_info(_NAME, onnx.TensorProto.FLOAT, ["batch", n])
+    )
+    return bound
+
+
+def _complete(
+    entries: "Mapping[str, onnx.ValueInfoProto]",
+    inputs: "Mapping[str, slice | np.ndarray]",
+    size: int | None,
+) -> "dict[str, slice | np.ndarray]":
+    """Return the part of each input; the one that is left out has the columns that are."""
+    listed = ", ".join(_described(entry) for entry in entries.values())
+    if unknown := [name for name in inputs if name not in entries]:
+        raise SettingError(f"inputs: {unknown[0]!r}", f"one of {listed}", "name one of these")
+    parts, left = dict(inputs), [name for name in entries if name not in inputs]
+    if len(left) > 1:
+        written = ", ".join(f'"{name}": ...' for name in left)
+        raise SettingError(
+            f"inputs: nothing for {' and '.join(map(repr, left))}, of {listed}",
+            "all inputs but one, which is given the other columns",
+            f'write inputs={{{written}}}, each a number or columns such as "0:3"',
+        )
+    taken = sorted((p.start, p.stop) for p in parts.values() if isinstance(p, slice))
+    for name in left:
+        dimensions = entries[name].type.tensor_type.shape.dim
+        width = dimensions[-1].dim_value if dimensions else 0
+        start = 0 if not taken or taken[0][0] > 0 else taken[-1][1]
+        stop = start + width if width else size
+        if stop is None or stop <= start:
+            example = f'write inputs={{"{name}": "{start}:..."}}'
+            raise SettingError(
+                f"inputs: {_described(entries[name])} is open", "its columns", example
+            )
+        parts[name] = slice(start, stop)
+    if not any(isinstance(part, slice) for part in parts.values()):
+        raise SettingError(
+            "inputs: all of them are constants", "one with the observation", _EXAMPLE
+        )
+    return parts
+
+
+class _Feed:
+    """The nodes that make an input of what it is given."""
+
+    def __init__(self, prefix: str, name: str, kind: int) -> None:
+        self.nodes: list[onnx.NodeProto] = []
+        self.constants: list[onnx.TensorProto] = []
+        self._prefix, self._name, self._kind = prefix, name, kind
+
+    def take(self, columns: slice) -> None:
+        """Give it columns of the observation."""
+        ends = (columns.start, columns.stop, 1, 1)
+        names = [
+            self._keep(what, np.array([end], np.int64))
+            for what, end in zip(("starts", "ends", "axes", "steps"), ends, strict=True)
+        ]
+        self._cast(self._node("Slice", _NAME, *names))
+
+    def hold(self, value: np.ndarray, shape: list[int]) -> None:
+        """Give it a constant, a row for each observation where its first axis is one of rows."""
+        import onnx
+
+        if len(shape) != 2:
+            fixed = np.broadcast_to(value, [size or 1 for size in shape])
+            dtype = onnx.helper.tensor_dtype_to_np_dtype(self._kind)
+            self.constants.append(onnx.numpy_helper.from_array(fixed.astype(dtype), self._name))
+            return
+        width = shape[1] or value.size
+        row = np.broadcast_to(value.reshape(1, -1), (1, width)).astype(np.float32)
+        ends = [self._keep(what, np.array([end], np.int64)) for what, end in _FIRST]
+        # Columns of zeros as long as the batch; observations are finite.
+        first = self._node("Slice", _NAME, *ends)
+        zeros = self._node("Mul", first, self._keep("zero", np.zeros((1, 1), np.float32)))
+        self._cast(self._node("Add", zeros, self._keep("row", row)))
+
+    def _cast(self, value: str) -> None:
+        import onnx
+
+        self.nodes.append(onnx.helper.make_node("Cast", [value], [self._name], to=self._kind))
+
+    def _node(self, operator: str, *values: str) -> str:
+        import onnx
+
+        name = f"{self._prefix}.{len(self.nodes)}"
+        self.nodes.append(onnx.helper.make_node(operator, list(values), [name]))
+        return name
+
+    def _keep(self, what: str, value: np.ndarray) -> str:
+        import onnx
+
+        name = f"{self._prefix}.{what}"
+        self.constants.append(onnx.numpy_helper.from_array(value, name))
+        return name
+
+
+_FIRST = (("starts", 0), ("ends", 1), ("axes", 1), ("steps", 1))
+
+
+def _described(entry: "onnx.ValueInfoProto") -> str:
+    sizes = [d.dim_param or str(d.dim_value) for d in entry.type.tensor_type.shape.dim]
+    return shown(f"{entry.name} ({', '.join(sizes)})")
