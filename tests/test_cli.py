@@ -48,8 +48,14 @@ def expert(tmp_path_factory):
 def test_the_shell_has_the_functions_arguments_and_defaults(name):
     function = inspect.signature(getattr(fdtasil, name)).parameters
     command = inspect.signature(import_module(f"fdtasil.shell.{name}").command).parameters
-    assert set(function) - set(command) <= {"progress", "callback", "student", "fit"}
-    added = {"output", "trust"}
+    assert set(function) - set(command) <= {
+        "progress",
+        "callback",
+        "student",
+        "fit",
+        "constraints",
+    }
+    added = {"output", "inputs", "trust"}
     if name == "distill":
         added |= {"out", "baseline", "log_formats"} | SETTINGS
     assert set(command) - set(function) <= added

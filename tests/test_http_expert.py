@@ -317,3 +317,16 @@ def test_a_password_is_refused_and_not_shown():
 def test_a_timeout_is_a_number_of_seconds():
     with pytest.raises(SettingError, match="timeout=-1"):
         fdtasil.load_expert("http://127.0.0.1/act", timeout=-1)
+
+
+@pytest.mark.parametrize("null", [None, [None, None], [1.0, None]], ids=str)
+def test_null_is_no_answer(null, rows):
+    def answer(observations):
+        return {"actions": [[0.5, 0.25], null, [0.0, 1.0]]}
+
+    with serving(answer) as served:
+        expert = fdtasil.load_expert(served.address, 5, 2)
+        answers = expert.ask(rows[:3], "probe")
+    assert np.isnan(answers[1]).all()
+    assert answers[[0, 2]].tolist() == [[0.5, 0.25], [0.0, 1.0]]
+    assert expert.silence.rows == {"probe": 1}

@@ -297,3 +297,38 @@ def test_numbers_of_numpy_are_as_good_as_python_s(linear):
         for numbers in (given, plain)
     )
     assert json.dumps(ours) == json.dumps(theirs)  # as config.json has them
+
+
+def test_violations_of_constraints_are_counted(linear, tmp_path):
+    limits = {
+        "never": lambda states, actions: np.full(len(states), -1.0),
+        "position": lambda states, actions: np.abs(states[:, 0]) - 0.5,
+        "force": lambda states, actions: np.abs(actions).max(axis=1) > 0.2,
+    }
+    result = fdtasil.distill(linear, TOY, 3, **QUICK, constraints=limits)
+    found = {name: (theirs, ours) for name, theirs, ours in result.evaluation.violations}
+    assert found["never"] == (0, 0)
+    assert 0 < found["position"][0] < 1
+    assert 0 < found["force"][0] < 1
+    same = fdtasil.evaluate(linear, linear, TOY, episodes=2, horizon=20, constraints=limits)
+    for name, theirs, ours in same.violations:
+        assert theirs == ours == found[name][0]
+    assert "position          violated at" in str(same)
+    loaded = fdtasil.Distilled.load(result.save(tmp_path / "run"))
+    assert loaded.evaluation == result.evaluation
+
+
+@pytest.mark.parametrize(
+    ("limits", "found"),
+    [
+        ([1], "functions? of"),
+        ({"a": 3}, "function of"),
+        ({"a": lambda states, actions: states}, r"'a' returned shape \(\d+, 5\)"),
+        ({"a": lambda states: states[:, 0]}, "'a' raised TypeError"),
+        ({"a": lambda states, actions: states[:, 0] * np.nan}, "'a' returned shape"),
+    ],
+    ids=["list", "number", "shape", "raises", "nan"],
+)
+def test_what_is_no_constraint_is_refused(limits, found, linear):
+    with pytest.raises(SettingError, match=found):
+        fdtasil.evaluate(linear, linear, TOY, episodes=1, horizon=5, constraints=limits)

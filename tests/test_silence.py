@@ -186,3 +186,38 @@ def test_a_state_without_any_answered_probe_is_asked_about_itself():
     moved = ROWS[:, None] + answers.displacements[answers.numbers]
     assert answers.values[:, :, 0] == pytest.approx(moved @ GAIN.T, abs=1e-5)
     assert (moved[:, 0] == ROWS).all(axis=1).sum() == 14
+
+
+class Stop(Exception):
+    """Stands for a kill."""
+
+
+@pytest.mark.usefixtures("many_checkpoints")
+@pytest.mark.parametrize("count", [1, 3, 5])
+def test_it_resumes_to_the_byte_and_counts_each_silence_once(count, tmp_path):
+    def planner(rows):
+        return nan_planner(rows, limit=None)
+
+    run = {**QUICK, "episodes": 6, "trainer": "dagger", "probes": "sphere:2,resample"}
+    run |= {"fit": fdtasil.Fit(steps=105), "progress": False}
+    whole = fdtasil.distill(planner, TOY, out=tmp_path / "whole", **run)
+    events = []
+
+    def stop(event):
+        events.append(event)
+        if len(events) == count:
+            raise Stop
+
+    with pytest.raises(Stop):
+        fdtasil.distill(planner, TOY, out=tmp_path / "run", callback=stop, **run)
+    resumed = fdtasil.distill(planner, TOY, resume=tmp_path / "run", **run)
+    for name in ("student.safetensors", "demonstrations.npz", "progress.csv"):
+        assert (tmp_path / "run" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+    assert resumed.report["no_answer"] == whole.report["no_answer"]
+    assert resumed.report["rows_asked_again_after_resuming"] > 0
+
+
+def test_workers_and_servers_have_no_answer_too():
+    expert = load_expert(raising_planner, 5, 2, workers=2, batch=8)
+    answers = expert.ask(ROWS, "probe")
+    assert np.array_equal(np.isnan(answers).all(axis=1), beyond(ROWS, 1.0))

@@ -1,12 +1,13 @@
 """Paired evaluation: student and expert from the same starts, with an interval."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from fdtasil.errors import warn
+from fdtasil.checks import spelt
+from fdtasil.errors import SettingError, first_line, warn
 from fdtasil.experts.expert import Expert
 from fdtasil.files.plain import from_plain, to_plain
 from fdtasil.probes.scales import measure_scales
@@ -17,7 +18,18 @@ from fdtasil.rollouts.episodes import Episodes
 from fdtasil.rollouts.rollout import rollout
 from fdtasil.seeding import generator
 
-__all__ = ["Evaluation", "evaluate_pair", "interval_text", "score_text"]
+__all__ = [
+    "Constraints",
+    "Evaluation",
+    "check_constraints",
+    "evaluate_pair",
+    "interval_text",
+    "score_text",
+]
+
+Constraints = Mapping[str, Callable[[np.ndarray, np.ndarray], np.ndarray]]
+"""Name -> function of (N, n) observations and the (N, m) actions taken there: (N,) numbers,
+positive where the constraint is violated."""
 
 _RESAMPLES = 2000
 
@@ -49,6 +61,8 @@ class Evaluation:
         expert_physics_resets: Episodes of the expert in which the simulator put itself back.
         physics_resets: The same for the student; where they are more than half, the returns mean
             nothing and there is no normalised one.
+        violations: Of each constraint its name, and the share of the steps at which the expert
+            and the student violated it.
     """
 
     episodes: int
@@ -66,6 +80,7 @@ class Evaluation:
     student_returns: tuple[float, ...]
     expert_physics_resets: int = 0
     physics_resets: int = 0
+    violations: tuple[tuple[str, float, float], ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         """Return the evaluation as plain JSON values."""
@@ -80,12 +95,18 @@ class Evaluation:
         expert = f"{self.expert_return:10.1f}   survival {self.expert_survival:.2f}"
         student = f"{self.student_return:10.1f}   survival {self.survival:.2f}"
         share = f"{score_text(self.normalized_return):>10}   95 % {interval_text(self.ci95)}"
+        kept = "".join(
+            f"\n  {name:17} violated at {theirs:.2%} of the expert's steps, {ours:.2%} of the "
+            "student's"
+            for name, theirs, ours in self.violations
+        )
         return (
             f"{self.episodes} paired episodes of {self.horizon} steps\n"
             f"  expert            {expert}\n"
             f"  student           {student}\n"
             f"  normalised return {share}\n"
             f"  action error      {self.action_error:10.3f}   on the student's own states"
+            f"{kept}"
         )
 
 
@@ -97,6 +118,7 @@ def evaluate_pair(
     horizon: int,
     seed: int,
     progress: Progress,
+    constraints: Constraints | None = None,
 ) -> Evaluation:
     """Run a policy from the starts of the expert's episodes, and compare.
 
@@ -108,6 +130,7 @@ def evaluate_pair(
         horizon: T.
         seed: Of the bootstrap, and of the random actions where they are the reference.
         progress: Progress bars.
+        constraints: What is counted where it is violated.
     """
     seeds = [int(s) for s in expert_episodes.seeds]
     with progress.bar("evaluation", "step", len(seeds) * horizon) as bar:
@@ -144,7 +167,53 @@ def evaluate_pair(
         student_returns=tuple(ours.tolist()),
         expert_physics_resets=int((expert_episodes.physics_resets > 0).sum()),
         physics_resets=int(reset.sum()),
+        violations=tuple(
+            (
+                name,
+                _violated(name, constraint, expert_episodes, pool),
+                _violated(name, constraint, student_episodes, pool),
+            )
+            for name, constraint in (constraints or {}).items()
+        ),
     )
+
+
+def check_constraints(constraints: object) -> Constraints:
+    """Refuse what are no constraints.
+
+    Raises:
+        SettingError: If they are something else.
+    """
+    good = isinstance(constraints, Mapping) and all(
+        isinstance(name, str) and callable(one) for name, one in constraints.items()
+    )
+    if not good:
+        raise SettingError(spelt("constraints", constraints), _CONSTRAINTS, _LIMIT)
+    return constraints  # pyright: ignore[reportReturnType]
+
+
+_CONSTRAINTS = "names, each with a function of (N, n) observations and (N, m) actions"
+_LIMIT = 'write for example constraints={"rail": lambda x, u: abs(x[:, 0]) - 1}'
+
+
+def _violated(
+    name: str,
+    constraint: Callable[[np.ndarray, np.ndarray], np.ndarray],
+    episodes: Episodes,
+    pool: EnvironmentPool,
+) -> float:
+    """Return the share of the steps at which a constraint is violated."""
+    states = episodes.observations[episodes.valid]
+    actions, _ = pool.bounds.put_inside(episodes.actions[episodes.valid])
+    try:
+        found = np.asarray(constraint(states.copy(), actions.copy()), np.float64)
+    except Exception as error:
+        said = f"constraints: {name!r} raised {type(error).__name__}: {first_line(error)}"
+        raise SettingError(said, _CONSTRAINTS, _LIMIT) from error
+    if found.shape != (len(states),) or np.isnan(found).any():
+        said = f"constraints: {name!r} returned shape {found.shape}"
+        raise SettingError(said, f"({len(states)},) numbers, positive where violated", _LIMIT)
+    return float((found > 0).mean())
 
 
 def _reference_return(

@@ -18,7 +18,7 @@ from fdtasil.probes.source import Probes
 from fdtasil.probes.spread import SpreadLike
 from fdtasil.progress import Progress
 from fdtasil.results.distilled import Distilled, write_run
-from fdtasil.results.evaluation import Evaluation, evaluate_pair
+from fdtasil.results.evaluation import Constraints, Evaluation, check_constraints, evaluate_pair
 from fdtasil.rollouts.behaviours import follow, follow_answers
 from fdtasil.rollouts.environments import EnvironmentLike, EnvironmentPool, resolve_horizon
 from fdtasil.rollouts.episodes import Episodes
@@ -62,6 +62,7 @@ def distill(
     preset: str = "standard",
     dataset: DatasetLike | None = None,
     evaluation_episodes: int = 20,
+    constraints: Constraints | None = None,
     max_queries: int | None = None,
     device: str = "cpu",
     force: bool = False,
@@ -118,6 +119,8 @@ def distill(
             `Dataset`. Stored answers to probes are used as they are, but where they are those of
             "fresh" and a cheap expert can be asked anew.
         evaluation_episodes: Episodes of the paired evaluation; 0 leaves it out.
+        constraints: Name -> function of (N, n) observations and the (N, m) actions taken there,
+            positive where the constraint is violated; the evaluation counts these steps.
         max_queries: Refuse to start a run that may ask the expert more often; where `probes` are
             left out, they are those that it allows.
         device: Where the student is trained: "cpu", "cuda", "cuda:N".
@@ -154,6 +157,7 @@ def distill(
         (1,)
     """
     folder, force = _folder_of(out, resume), check_flag("force", force)
+    limits = None if constraints is None else check_constraints(constraints)
     progress = check_flag("progress", progress)
     given = None if dataset is None else load_dataset(dataset)
     arguments = read_arguments(
@@ -191,7 +195,7 @@ def distill(
             checkpoints = Checkpoints(kept, account, Asking(run, subject.expert, account))
             training = Training(run, chosen, checkpoints, bars, interrupts, told)
             rounds = Rounds(run, student_obs, _collecting(run, subject, bars), training)
-            result = _complete(rounds, subject, given, chosen, force=force)
+            result = _complete(rounds, subject, given, chosen, limits, force=force)
             if folder:
                 write_run(result, folder)
                 kept.close()
@@ -207,6 +211,7 @@ def evaluate(
     horizon: int | None = None,
     seed: int = 0,
     student_obs: StudentObservation | None = None,
+    constraints: Constraints | None = None,
     force: bool = False,
     progress: bool = True,
 ) -> Evaluation:
@@ -222,6 +227,7 @@ def evaluate(
         seed: Of the starts; those of `distill` with the same seed.
         student_obs: What the policy sees, as in `distill`; an ONNX file that fdtasil exported
             says its indices itself.
+        constraints: As in `distill`.
         force: Go on with a warning where the expert fails the gate but answers.
         progress: Show progress bars, where there is a terminal.
 
@@ -240,6 +246,7 @@ def evaluate(
     """
     check_count("seed", seed, 0, 2**32 - 1)
     force = check_flag("force", force)
+    limits = None if constraints is None else check_constraints(constraints)
     count, bars = check_count("episodes", episodes), Progress(check_flag("progress", progress))
     with EnvironmentPool(env) as pool, torch_settings(torch.device("cpu")):
         n, m = pool.boxes.observation_size, pool.boxes.action_size
@@ -251,7 +258,8 @@ def evaluate(
         seen = judged.columns if student_obs is None else student_obs
         view = View.of(seen, theirs.observations[theirs.valid][:256])
         answer = view.policy(sized(judged, view.size, m).policy("evaluate"))
-        return evaluate_pair(follow_answers(answer), black_box, theirs, pool, length, seed, bars)
+        acting = follow_answers(answer)
+        return evaluate_pair(acting, black_box, theirs, pool, length, seed, bars, limits)
 
 
 def _folder_of(out: str | Path | None, resume: str | Path | None) -> Path | None:
@@ -277,6 +285,7 @@ def _complete(
     subject: Subject,
     given: Dataset | None,
     device: torch.device,
+    constraints: Constraints | None,
     *,
     force: bool,
 ) -> Distilled:
@@ -297,6 +306,7 @@ def _complete(
                 run.horizon,
                 run.seed,
                 rounds.training.progress,
+                constraints,
             )
             about = int(last["round"]), trained.steps, last
             rounds.training.callback(Event("evaluation", *about, student, evaluation))

@@ -188,7 +188,15 @@ command = as_command(
     [
         Flags(
             distill,
-            without=("student", "fit", "callback", "progress", "out", "device"),
+            without=(
+                "student",
+                "fit",
+                "constraints",
+                "callback",
+                "progress",
+                "out",
+                "device",
+            ),
             types={
                 "expert": OptionalExpert,
                 "env": OptionalEnvironment,

@@ -24,7 +24,7 @@ command = as_command(
     [
         Flags(
             evaluate,
-            without=("progress",),
+            without=("constraints", "progress"),
             types={
                 "policy": PolicyPath,
                 "env": EnvironmentId,
