@@ -225,7 +225,7 @@ def test_normalisation_over_the_batch(tmp_path):
 
 
 @pytest.mark.fault(42)
-def test_a_recurrent_network_is_refused(tmp_path):
+def test_a_recurrent_network_has_a_memory(tmp_path):
     with torch.random.fork_rng():
         torch.manual_seed(0)
         module = torch.nn.LSTM(5, 2).eval()
@@ -233,9 +233,13 @@ def test_a_recurrent_network_is_refused(tmp_path):
     names = {"input_names": ["obs", "h", "c"], "output_names": ["actions", "h1", "c1"]}
     path = tmp_path / "lstm.onnx"
     torch.onnx.export(module, inputs, path, dynamo=True, verbose=False, **names)
-    text = error_of(lambda: fdtasil.load_expert(path, 5, 2))
-    assert "has 3 inputs: obs float (1, 1, 5), h float" in text
-    assert "policies with memory can't be distilled" in text
+    expert = fdtasil.load_expert(path, 5, 2)
+    assert (expert.observation_size, expert.memory.size) == (5 + 4, 4)
+    rows = np.random.default_rng(0).standard_normal((3, 9)).astype(np.float32)
+    state = torch.from_numpy(rows[:, 5:7])[None], torch.from_numpy(rows[:, 7:])[None]
+    with torch.no_grad():
+        expected, _ = module(torch.from_numpy(rows[:, :5])[None], state)
+    assert expert.ask(rows, "act") == pytest.approx(expected[0].numpy(), abs=1e-5)
 
 
 @pytest.mark.fault(43)

@@ -9,6 +9,7 @@ import numpy as np
 import torch
 
 from fdtasil.errors import ExpertError, SettingError, in_one_line
+from fdtasil.experts.memory import Memory
 from fdtasil.experts.sb3.trust import Trust
 from fdtasil.experts.silence import Silence
 from fdtasil.experts.worker_process import as_array
@@ -16,8 +17,9 @@ from fdtasil.rollouts.behaviours import Policy, has_none
 
 __all__ = ["Expert", "Hints", "Purpose", "RaisedElsewhere"]
 
-Purpose = Literal["check", "act", "label", "calibrate", "probe", "evaluate"]
-"""Why a row was asked: gate, acting in rollouts, labels, radius, probes, evaluation."""
+Purpose = Literal["check", "act", "label", "calibrate", "probe", "evaluate", "remember"]
+"""Why a row was asked: gate, acting in rollouts, labels, radius, probes, evaluation, and what is
+remembered after it."""
 
 CHUNK = 1024  # rows asked at once; a fixed size keeps onnxruntime's memory from growing
 
@@ -31,6 +33,7 @@ class Hints:
         action_size: m, or None; chooses among the outputs of an ONNX file.
         output: Name of the ONNX output that holds the actions, or None.
         inputs: What the inputs of an ONNX file are given, where it has several.
+        memory: Inputs that hold a memory, and the outputs that it comes out of.
         trust: "pickle" where code inside a file may be run.
         timeout: Seconds that a batch may take, or None.
     """
@@ -41,6 +44,7 @@ class Hints:
     trust: Trust = None
     timeout: float | None = None
     inputs: Mapping[str, slice | np.ndarray] | None = None
+    memory: Mapping[str, str] | None = None
 
 
 class RaisedElsewhere(Exception):
@@ -80,6 +84,8 @@ class Expert:
         columns: The coordinates that a student's file says it sees, or None.
         jacobian: (B, n) observations -> (B, m, n) derivatives of the actions, where the expert
             may give them itself; or None.
+        memory: What it carries along an episode, or None. Its observations are then those of the
+            environment with the memory behind them; see `memory.py`.
         module: The same function as a differentiable torch module, or None; only the analytic
             reference (`probes="jacobian"`) uses it.
         multiply_adds: At most how many a row takes, where the file says it; see `cost.py`.
@@ -109,6 +115,7 @@ class Expert:
     multiply_adds: int | None = None
     silence: Silence = field(default_factory=Silence)
     jacobian: Callable[[np.ndarray], np.ndarray] | None = None
+    memory: Memory | None = None
 
     def ask(self, observations: np.ndarray, purpose: Purpose) -> np.ndarray:
         """Answer a batch and count its rows.

@@ -3,7 +3,7 @@
 import dataclasses
 import warnings
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -53,6 +53,7 @@ def load_expert(
     *,
     output: str | None = None,
     inputs: Inputs | None = None,
+    memory: Mapping[str, str] | None = None,
     batch: int | None = None,
     trust: Trust = None,
     workers: int = 0,
@@ -75,6 +76,8 @@ def load_expert(
         inputs: What the inputs of an ONNX file are given, where it has several: a number or an
             array always, or columns of the observation ("0:17"); one that is left out is given
             the other columns.
+        memory: Inputs of an ONNX file that hold a memory, and the outputs that it comes out of,
+            {"h_in": "h_out"}; left out, they are found by their names and sizes.
         batch: Rows asked at once; 1 asks row by row. Left out, it is 1024, 64 over HTTP, 8
             with `workers`: equal batches give equal bytes, whatever the number of workers.
         trust: "pickle" lets stable-baselines3 load what can't be read from a zip without running
@@ -108,7 +111,7 @@ def load_expert(
         raise SettingError(spelt("output", output), "the name of an output", example)
     threads = check_flag("threads", threads)
     bound = None if inputs is None else check_inputs(inputs)
-    hints = Hints(observation_size, action_size, output, trust, timeout, bound)
+    hints = Hints(observation_size, action_size, output, trust, timeout, bound, memory)
     kind = _kind_of(source)
     workers, timeout = check_workers(workers, threads, timeout, kind.remote)
     expert = sized(open_expert(source, hints), observation_size, action_size)
@@ -118,6 +121,12 @@ def load_expert(
         expert = dataclasses.replace(expert, chunk=check_count("batch", batch))
     if not workers:
         return expert
+    if expert.memory is not None:
+        raise SettingError(
+            f"workers={workers} with {expert.name}, which has a memory",
+            "one process: what is remembered comes from the step before",
+            "leave workers= out",
+        )
     if threads or kind.remote:  # who waits for a server needs no process
         return with_threads(expert, workers)
     return with_processes(expert, _opener(source, expert, hints), workers, timeout)
@@ -133,7 +142,9 @@ def open_expert(source: ExpertLike, hints: Hints) -> Expert:
 
 def sized(expert: Expert, observation_size: int | None, action_size: int | None) -> Expert:
     """Return the expert with its sizes, where they are not others than those expected."""
-    said = (expert.observation_size, expert.action_size)
+    # What is remembered lies behind the environment's observations.
+    carried = expert.memory.size if expert.memory else 0
+    said = (expert.observation_size and expert.observation_size - carried, expert.action_size)
     expected = (observation_size, action_size)
     for role, ours, theirs in zip(("observations", "actions"), said, expected, strict=True):
         if ours is not None and theirs is not None and ours != theirs:
@@ -144,7 +155,9 @@ def sized(expert: Expert, observation_size: int | None, action_size: int | None)
                 size_hint(ours, theirs) if role == "observations" else step,
             )
     return dataclasses.replace(
-        expert, observation_size=said[0] or expected[0], action_size=said[1] or expected[1]
+        expert,
+        observation_size=expert.observation_size or expected[0],
+        action_size=said[1] or expected[1],
     )
 
 
@@ -220,7 +233,7 @@ def _from_torch(module: torch.nn.Module, hints: Hints) -> Expert:
     """Ask a module by calling it, unless it has a `predict` that answers otherwise."""
     if not isinstance(module, Predictor) or _is_the_policy(module, hints.observation_size):
         return open_module(module)
-    return open_predictor(module)
+    return open_predictor(module, hints.observation_size)
 
 
 def _is_the_policy(module: torch.nn.Module, observation_size: int | None) -> bool:
@@ -237,7 +250,7 @@ def _is_the_policy(module: torch.nn.Module, observation_size: int | None) -> boo
 
 
 def _from_predictor(source: Predictor, hints: Hints) -> Expert:
-    return open_predictor(source)
+    return open_predictor(source, hints.observation_size)
 
 
 def _from_function(function: Callable[[np.ndarray], np.ndarray], hints: Hints) -> Expert:

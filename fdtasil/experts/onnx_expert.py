@@ -1,19 +1,27 @@
 """ONNX files as experts, with the names, types and batch sizes that users' files have."""
 
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from torch.nn import Module
 
-from fdtasil.errors import ExpertError, shown
+from fdtasil.errors import ExpertError, SettingError, shown
 from fdtasil.experts.cost import stored_numbers
 from fdtasil.experts.expert import Expert, Hints
+from fdtasil.experts.memory import Memory, stateless
 from fdtasil.experts.sizes import size_hint
 from fdtasil.experts.trial import try_out
 from fdtasil.experts.twin import torch_twin
 from fdtasil.files.onnx.binding import bind
 from fdtasil.files.onnx.model import read_model
-from fdtasil.files.onnx.policy import OnnxPolicy, cannot_be_asked, open_policy
+from fdtasil.files.onnx.policy import (
+    OnnxPolicy,
+    cannot_be_asked,
+    open_policy,
+    open_within_limits,
+)
+from fdtasil.files.onnx.recurrent import RecurrentPolicy, find_memory, try_recurrent
 
 if TYPE_CHECKING:
     import onnx
@@ -42,6 +50,9 @@ def open_onnx(source: str | Path, hints: Hints) -> Expert:
     model, digest = read_model(path)
     columns = _columns(model, path)
     wanted = None if columns else hints.observation_size
+    pairs = find_memory(model, hints.memory, list(hints.inputs or ()))
+    if pairs:
+        return _recurrent(source, model, digest, pairs, hints)
     if hints.inputs:
         model = bind(model, hints.inputs, wanted)
     data = model.SerializeToString()
@@ -53,13 +64,49 @@ def open_onnx(source: str | Path, hints: Hints) -> Expert:
             size_hint(n, wanted),
         )
     call = (data, str(path), wanted, hints.action_size, hints.output)
-    try_out(digest, str(path), call, straight=_is_straight(model))
+    work = partial(open_within_limits, *call, straight=_is_straight(model))
+    try_out(digest, str(path), work)
     policy, n, m = open_policy(*call)
     twin = _twin(model, policy, n, path)
     # One that takes a row at a time costs as much as a slow one, however small it is.
     work = None if policy.one_by_one else stored_numbers(model)
     about = {"source": str(source), "columns": columns, "multiply_adds": work}
     return Expert(policy, path.name, n, m, digest, twin, **about)
+
+
+def _recurrent(
+    source: str | Path,
+    model: "onnx.ModelProto",
+    digest: str,
+    pairs: tuple[tuple[str, str], ...],
+    hints: Hints,
+) -> Expert:
+    """Open a model with a memory."""
+    if hints.inputs:
+        raise SettingError(
+            f"inputs= of {source}, which has a memory",
+            "an observation and a memory, and nothing else that goes in",
+            "wrap its session in an object with predict(observation, state)",
+        )
+    name = str(source)
+    call = (model.SerializeToString(), name, pairs, hints.observation_size, hints.action_size)
+    try_out(digest, name, partial(try_recurrent, *call, hints.output))
+    try:
+        policy = RecurrentPolicy(*call, hints.output)
+    except ExpertError:
+        raise
+    except Exception as error:  # onnxruntime has its own
+        raise cannot_be_asked(name, error) from error
+    n, k = policy.observation_size, policy.memory_size
+    return Expert(
+        stateless(policy, n),
+        Path(source).name,
+        n + k,
+        policy.action_size,
+        digest,
+        source=name,
+        memory=Memory(k, policy),
+    )
 
 
 def _declared_size(model: "onnx.ModelProto") -> int:

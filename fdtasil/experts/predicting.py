@@ -3,12 +3,14 @@
 import inspect
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
 
 from fdtasil.errors import ExpertError, warn
 from fdtasil.experts.expert import Expert
+from fdtasil.experts.memory import Memory, stateless
 from fdtasil.experts.own_jacobian import own_jacobian
 
 __all__ = ["open_predictor"]
@@ -18,8 +20,8 @@ _HARMLESS = {"VecMonitor", "VecCheckNan", "VecVideoRecorder", "VecNormalize"}
 _ITS_OWN = "stable_baselines3.common.base_class"
 
 
-def open_predictor(source: Any) -> Expert:
-    """Ask an object by its `predict`.
+def open_predictor(source: Any, observation_size: int | None = None) -> Expert:
+    """Ask an object by its `predict`; one that returns a state has a memory.
 
     An agent that was trained in VecNormalize is asked about what that makes of an observation, as
     its own library does.
@@ -31,6 +33,10 @@ def open_predictor(source: Any) -> Expert:
     # scikit-learn's predict takes the batch alone; stable-baselines3's is stochastic by default.
     parameters = inspect.signature(source.predict).parameters
     options = {"deterministic": True} if "deterministic" in parameters else {}
+    if "state" in parameters and observation_size is not None:
+        carried = _carried(source, name, options, observation_size)
+        if carried is not None:
+            return carried
     answer = _Predicts(_asked(source), name, options, _statistics(source))
     return Expert(answer, name, jacobian=own_jacobian(source))
 
@@ -65,6 +71,99 @@ class _Predicts:
                 "distil a policy that depends on the observation only",
             )
         return actions
+
+
+def _carried(
+    source: Any, name: str, options: Mapping[str, bool], observation_size: int
+) -> Expert | None:
+    """Return an object with a memory as an expert, or None where it has none."""
+    asked, statistics = _asked(source), _statistics(source)
+    try:
+        states = [_ask_first(asked, rows, observation_size, options) for rows in (2, 3)]
+    except Exception:  # of the user's; the gate will show it
+        return None
+    if any(state is None for state in states):
+        return None
+    axes = [_axis(*parts) for parts in zip(*map(_leaves, states), strict=True)]
+    if None in axes:  # no memory of rows
+        return None
+    step = _Carries(asked, statistics, options, tuple(axis or 0 for axis in axes))
+    first = _flat(_leaves(states[0]), step.axes)
+    memory = Memory(first.shape[1], step)
+    n = observation_size
+    return Expert(stateless(step, n), name, n + memory.size, memory=memory)
+
+
+def _ask_first(source: Any, rows: int, n: int, options: Mapping[str, bool]) -> Any:
+    begun = np.ones(rows, bool)
+    answer = source.predict(np.zeros((rows, n), np.float32), episode_start=begun, **options)
+    return answer[1] if isinstance(answer, tuple) and len(answer) == 2 else None
+
+
+def _leaves(state: Any) -> list[np.ndarray]:
+    """Return the arrays of a state: one, or a tuple of them."""
+    return [np.asarray(part) for part in (state if isinstance(state, tuple | list) else (state,))]
+
+
+def _axis(two: np.ndarray, three: np.ndarray) -> int | None:
+    """Return which axis of a part is that of rows, from parts for two rows and for three."""
+    if two.ndim != three.ndim:
+        return None
+    axes = (axis for axis in range(two.ndim) if (two.shape[axis], three.shape[axis]) == (2, 3))
+    return next(axes, None)
+
+
+def _flat(parts: list[np.ndarray], axes: tuple[int, ...]) -> np.ndarray:
+    """Return (B, k) of the parts of a state."""
+    moved = [np.moveaxis(part, axis, 0) for part, axis in zip(parts, axes, strict=True)]
+    return np.concatenate([part.reshape(len(part), -1) for part in moved], 1).astype(np.float32)
+
+
+@dataclass
+class _Carries:
+    """An object's `predict`, with its state as one vector a row.
+
+    Attributes:
+        source: Has `predict(observation, state, episode_start)`.
+        statistics: The VecNormalize that it was trained in, or None.
+        options: What `predict` is called with besides.
+        axes: Of rows, in each part of a state.
+    """
+
+    source: Any
+    statistics: Any
+    options: Mapping[str, bool]
+    axes: tuple[int, ...]
+
+    def __call__(
+        self, observations: np.ndarray, memories: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        if self.statistics is not None:
+            observations = self.statistics.normalize_obs(observations)
+        rows, like = len(observations), self._like(observations.shape[1])
+        parts, start = [], 0
+        for part, axis in zip(_leaves(like), self.axes, strict=True):
+            shape = np.moveaxis(part, axis, 0).shape[1:]
+            stop = start + int(np.prod(shape))
+            moved = memories[:, start:stop].reshape(rows, *shape).astype(part.dtype)
+            parts.append(np.ascontiguousarray(np.moveaxis(moved, 0, axis)))
+            start = stop
+        state = tuple(parts) if isinstance(like, tuple | list) else parts[0]
+        begun = np.zeros(rows, bool)
+        actions, after = self.source.predict(
+            observations, state=state, episode_start=begun, **self.options
+        )
+        return actions, _flat(_leaves(after), self.axes)
+
+    @cached_property
+    def _first(self) -> dict[int, Any]:
+        return {}
+
+    def _like(self, n: int) -> Any:
+        """Return a state of two rows, for the shapes of its parts."""
+        if n not in self._first:
+            self._first[n] = _ask_first(self.source, 2, n, self.options)
+        return self._first[n]
 
 
 def _asked(source: Any) -> Any:

@@ -7,14 +7,11 @@ not tried again.
 
 import pickle
 from collections.abc import Callable
-from functools import partial
-from typing import Any
 
 from fdtasil.errors import ExpertError, shown
 from fdtasil.experts.expert import RaisedElsewhere
 from fdtasil.experts.workers.handle import Ended, in_a_process
 from fdtasil.files.onnx.limits import MEMORY
-from fdtasil.files.onnx.policy import open_within_limits
 
 __all__ = ["try_out", "vouch_for"]
 
@@ -31,22 +28,20 @@ def vouch_for(digest: str | None) -> None:
         _PASSED.add(digest)
 
 
-def try_out(digest: str, name: str, call: tuple[Any, ...], *, straight: bool) -> None:
+def try_out(digest: str, name: str, work: Callable[[], object]) -> None:
     """Open a model in a process of its own, unless one with this hash has passed before.
 
     Args:
         digest: sha256 of the file.
         name: What to call it.
-        call: The arguments of `open_policy`.
-        straight: Whether it may be asked about any observation, for it has no loop.
+        work: Opens it and asks it a little.
 
     Raises:
         ExpertError: If the process crashes, takes too much memory or too long, or what
-            `open_policy` raises in it.
+            `work` raises in it.
     """
     if digest in _PASSED:
         return
-    work: Callable[[], object] = partial(open_within_limits, *call, straight)
     try:
         in_a_process(pickle.dumps(work), _SECONDS)
     except Ended as ended:

@@ -127,11 +127,18 @@ class EnvironmentPool:
             warnings.simplefilter("ignore")  # the first copy has said it all
             while self._owned and not self._single and len(self._members) < count:
                 made = self._new()
-                if any(made is member for member in self._members):
+                if any(made.unwrapped is member.unwrapped for member in self._members):
                     self._owned = False  # a factory that hands out one and the same
                     break
                 self._members.append(made)
         return self._members[:count]
+
+    def wrap(self, wrapper: Callable[[gymnasium.Env], gymnasium.Env]) -> None:
+        """Put a wrapper around every copy, those that are made later too."""
+        make = self._make
+        self._make = lambda: wrapper(make())
+        self._members = [wrapper(member) for member in self._members]
+        self.boxes, self.bounds = _read_boxes(self._members[0], self.name)
 
     def keep_to_one(self) -> None:
         """Hand out the first copy alone from now on."""

@@ -19,6 +19,9 @@ from fdtasil.student.fit import Fit
 __all__ = ["Configuration"]
 
 
+_TRIED = 200  # steps in which environments are tried before anything is recorded
+
+
 @dataclass(frozen=True)
 class Configuration:
     """What a run does, with nothing left open.
@@ -50,6 +53,7 @@ class Configuration:
         fingerprint: Of the environment; see `rollouts/trials.py`. None where there is none, or it
             does not repeat itself.
         reason: How often probes are asked and why, where no caller says which they are.
+        remembered: Length of the expert's memory; 0 where it has none.
     """
 
     expert: str | None
@@ -77,6 +81,7 @@ class Configuration:
     spread: Spread
     fingerprint: dict[str, Any] | None
     reason: str | None
+    remembered: int = 0
 
     def predicted_queries(self) -> dict[str, int]:
         """Return the rows that the run will ask the expert for, by purpose.
@@ -99,6 +104,8 @@ class Configuration:
             again = GATE_STATES if self.evaluation_episodes or self.trainer is not None else 0
             found["check"] = gates * GATE_QUERIES + self._largest_batch(found) + again
             found["evaluate"] = 2 * self.evaluation_episodes * self.horizon
+        if self.remembered:  # each step of the environment
+            found["remember"] = found["act"] + found["label"] + found["evaluate"] + _TRIED
         return found
 
     def most_queries(self) -> int:

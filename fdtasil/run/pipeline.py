@@ -1,6 +1,7 @@
 """distill(): the whole story, from an expert and an environment to a student."""
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 
 import torch
@@ -35,7 +36,7 @@ from fdtasil.run.interrupts import heard_interrupts
 from fdtasil.run.lesson import Lesson
 from fdtasil.run.report import config_of, no_answer, report_of
 from fdtasil.run.rounds import Rounds
-from fdtasil.run.subject import Subject, open_subject
+from fdtasil.run.subject import Subject, carry, open_subject, visible
 from fdtasil.run.training import Training
 from fdtasil.seeding import episode_seeds
 from fdtasil.student.architectures import Architecture
@@ -180,6 +181,8 @@ def distill(
     chosen, told = pick_device(arguments.device), tell_all(callback)
     with heard_warnings() as notes, open_subject(expert, env, given) as subject:
         going_on = asked_anew(folder) if folder is not None and resume is not None else None
+        student_obs = visible(student_obs, subject.expert, subject.observation_size)
+        arguments = replace(arguments, student_obs=student_obs)
         run, bars = arguments.configure(subject, going_on), Progress(progress)
         run.check_spread()
         run.check_budget()
@@ -252,10 +255,18 @@ def evaluate(
         n, m = pool.boxes.observation_size, pool.boxes.action_size
         black_box, length = load_expert(expert, n, m), resolve_horizon(horizon, pool)
         judged = open_expert(policy, Hints(view_size(student_obs, n), m))
+        if judged.memory is not None:
+            raise SettingError(
+                f"{judged.name}, which has a memory, to be judged",
+                "a policy without one",
+                "compare it as the expert: evaluate(student, it, env)",
+            )
+        n += carry(black_box, pool)
         starts = episode_seeds(seed, "evaluation", 0, count)
         most = large_batch(count, black_box.chunk)
         theirs = examine(black_box, pool, starts, length, bars, force=force, largest=most)
-        seen = judged.columns if student_obs is None else student_obs
+        student_obs = judged.columns if student_obs is None else student_obs
+        seen = visible(student_obs, black_box, n)
         view = View.of(seen, theirs.observations[theirs.valid][:256])
         answer = view.policy(sized(judged, view.size, m).policy("evaluate"))
         acting = follow_answers(answer)

@@ -4,13 +4,17 @@ from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 
+import numpy as np
+
 from fdtasil.demonstrations.dataset import Dataset
 from fdtasil.errors import SettingError
 from fdtasil.experts.expert import Expert
 from fdtasil.experts.load import ExpertLike, load_expert
 from fdtasil.rollouts.environments import EnvironmentLike, EnvironmentPool
+from fdtasil.rollouts.remembering import Remembering
+from fdtasil.student.view import StudentObservation, describe_view
 
-__all__ = ["Subject", "open_subject"]
+__all__ = ["Subject", "carry", "open_subject", "visible"]
 
 
 @dataclass(frozen=True)
@@ -21,8 +25,9 @@ class Subject:
         expert: The black box, or None where nobody is asked.
         pool: The environment, or None where nothing is recorded.
         environment: What to call it.
-        observation_size: n.
+        observation_size: n; with what the expert remembers behind the environment's own.
         action_size: m.
+        remembered: Length of the expert's memory; 0 where it has none.
     """
 
     expert: Expert | None
@@ -30,6 +35,7 @@ class Subject:
     environment: str
     observation_size: int
     action_size: int
+    remembered: int = 0
 
     @property
     def comparable(self) -> bool:
@@ -67,7 +73,52 @@ def open_subject(
                 f"{(n, m)}, as {name}",
                 "pass the environment that they were recorded in, or none",
             )
-        opened = None
+        opened, remembered = None, 0
         if expert is not None:
             opened = load_expert(expert, n, m)
-        yield Subject(opened, pool, name, n, m)
+            remembered = carry(opened, pool)
+        yield Subject(opened, pool, name, n + remembered, m, remembered)
+
+
+def carry(expert: Expert, pool: EnvironmentPool | None) -> int:
+    """Let an environment show what an expert would remember; return how many numbers that is.
+
+    Raises:
+        SettingError: If there is no environment, and so nothing to remember.
+    """
+    if expert.memory is None:
+        return 0
+    if pool is None:
+        raise SettingError(
+            f"{expert.name}, which has a memory, without an environment",
+            "an environment, in which it remembers",
+            "pass env=",
+        )
+    memory = expert.memory
+
+    def after(observation: np.ndarray, remembered: np.ndarray) -> np.ndarray:
+        expert.count(1, "remember")
+        return memory.after(observation, remembered)
+
+    pool.wrap(lambda environment: Remembering(environment, after, memory.size))
+    return memory.size
+
+
+def visible(
+    student_obs: StudentObservation | None, expert: Expert | None, n: int
+) -> StudentObservation | None:
+    """Return what the student sees: never what the expert remembers.
+
+    Args:
+        student_obs: What the caller says, of the environment's own observations.
+        expert: The expert.
+        n: Length of an observation, with what is remembered.
+    """
+    if expert is None or expert.memory is None:
+        return student_obs
+    own = n - expert.memory.size
+    if student_obs is None:
+        return tuple(range(own))
+    if callable(student_obs) and not isinstance(student_obs, type):
+        return lambda rows: student_obs(rows[:, :own])
+    return describe_view(student_obs, own)  # pyright: ignore[reportReturnType]

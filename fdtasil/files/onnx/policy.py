@@ -3,7 +3,6 @@
 Nothing here needs torch: the process that tries unknown files starts in a moment.
 """
 
-import re
 import time
 import warnings
 from collections.abc import Sequence
@@ -14,6 +13,7 @@ import numpy as np
 
 from fdtasil.errors import ExpertError, FdtasilWarning, first_line, shown, warn
 from fdtasil.files.onnx.limits import limit_process
+from fdtasil.files.onnx.recurrent import MEMORY_NAMES
 from fdtasil.files.onnx.session import is_batched, open_session, rebatched, run_session
 
 if TYPE_CHECKING:
@@ -26,9 +26,6 @@ __all__ = ["OnnxPolicy", "cannot_be_asked", "open_policy", "open_within_limits"]
 _FLOATS = ("tensor(float)", "tensor(double)", "tensor(float16)")
 # Beside the models' own memory: the libraries, and copies of a model while it is opened.
 _ROOM, _COPIES = 2**30, 6
-_MEMORY = re.compile(
-    r"(?i)(^|[^a-z])(h|c)(x|n|0|_?(in|prev|t))?($|[^a-z])|state|hidden|cell|memory|rnn|lstm|gru|carry"
-)
 
 
 class OnnxPolicy:
@@ -195,15 +192,15 @@ def _several_inputs(session: "Session", name: str, described: str) -> ExpertErro
     # What goes in as it came out; a goal or a time goes in only.
     widths = [entry.shape[-1:] for entry in outputs if entry.shape]
     memory = any(
-        (_MEMORY.search(str(e.name)) or len(e.shape) == 3) and e.shape[-1:] in widths
+        (MEMORY_NAMES.search(str(e.name)) or len(e.shape) == 3) and e.shape[-1:] in widths
         for e in inputs[1:]
     )
     found = f"{name} has {len(inputs)} inputs: {described}"
     if memory:
         return ExpertError(
             f"{found}; they look like a policy's memory",
-            "one input (batch, n); policies with memory can't be distilled",
-            "choose a policy that depends on the observation only",
+            "one input (batch, n), or one and a memory that comes out again",
+            'say which: load_expert(path, memory={"h_in": "h_out"})',
         )
     start, parts = 0, []
     for entry in inputs:

@@ -1,0 +1,51 @@
+"""Experts with a memory: what they carry from step to step are further columns of an observation.
+
+What is carried depends on what was observed, not on who acts. So an expert with a memory is one
+without, of longer observations, in an environment that says what it would remember.
+"""
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from fdtasil.rollouts.behaviours import Policy
+
+__all__ = ["Memory", "Step", "stateless"]
+
+Step = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+"""(B, n) observations and (B, k) memories -> (B, m) actions, and the memories after them."""
+
+
+@dataclass(frozen=True)
+class Memory:
+    """What an expert carries along an episode, from zeros at its start.
+
+    Attributes:
+        size: k, how many numbers.
+        step: What it does with them.
+    """
+
+    size: int
+    step: Step
+
+    def after(self, observation: np.ndarray, memory: np.ndarray) -> np.ndarray:
+        """Return the memory (k,) after one observation (n,)."""
+        _, memories = self.step(observation[None].astype(np.float32), memory[None])
+        return memories[0]
+
+
+def stateless(step: Step, observation_size: int) -> Policy:
+    """Return the expert as a function of observations with the memory behind them."""
+    return _Stateless(step, observation_size)
+
+
+@dataclass(frozen=True)
+class _Stateless:
+    step: Step
+    observation_size: int
+
+    def __call__(self, rows: np.ndarray) -> Any:
+        n = self.observation_size
+        return self.step(rows[:, :n], rows[:, n:])[0]

@@ -1,0 +1,216 @@
+"""Experts with a memory: carried along each episode, kept by probes, never seen by the student."""
+
+import itertools
+
+import gymnasium
+import numpy as np
+import onnx
+import pytest
+from conftest import QUICK, TOY
+from onnx import TensorProto, helper, numpy_helper
+from toy_environments import Integrator
+
+import fdtasil
+from fdtasil.errors import SettingError
+from fdtasil.experts.load import load_expert
+
+pytestmark = pytest.mark.usefixtures("no_pictures")
+
+RANDOM = np.random.default_rng(0)
+NOW = RANDOM.standard_normal((5, 2)).astype(np.float32) / 4
+THEN = RANDOM.standard_normal((6, 2)).astype(np.float32) / 8
+KEEP = np.diag([0.5, 0.9, 0.1, 0.5, 0.3]).astype(np.float32)
+N, K = 5, 6
+
+
+def step(observations, memories):
+    """What the toy does: six numbers, a decaying sum of the observations and a clock."""
+    actions = np.tanh(observations @ NOW + memories @ THEN)
+    sums = memories[:, :5] @ KEEP + 0.1 * observations
+    return actions, np.concatenate([sums, memories[:, 5:] + 0.01], axis=1)
+
+
+class Remembers:
+    """Looks like sb3-contrib's recurrent agents: a tuple of arrays (layers, rows, size)."""
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        rows = len(observation)
+        if state is None:
+            state = np.zeros((1, rows, 5), np.float32), np.zeros((1, rows, 1), np.float32)
+        memory = np.concatenate([part[0] for part in state], axis=1)
+        memory = np.where(np.asarray(episode_start)[:, None], 0, memory)
+        actions, after = step(observation, memory)
+        return actions, (after[None, :, :5], after[None, :, 5:])
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory):
+    """The look of rsl_rl's exports: one row at a time, the state in and out."""
+
+    def entry(name, shape):
+        return helper.make_tensor_value_info(name, TensorProto.FLOAT, shape)
+
+    nodes = [
+        helper.make_node("Squeeze", ["h_in", "zero"], ["sums"]),
+        helper.make_node("Squeeze", ["c_in", "zero"], ["clock"]),
+        helper.make_node("Concat", ["sums", "clock"], ["memory"], axis=1),
+        helper.make_node("MatMul", ["obs", "now"], ["a"]),
+        helper.make_node("MatMul", ["memory", "then"], ["b"]),
+        helper.make_node("Add", ["a", "b"], ["c"]),
+        helper.make_node("Tanh", ["c"], ["actions"]),
+        helper.make_node("MatMul", ["sums", "keep"], ["kept"]),
+        helper.make_node("Mul", ["obs", "tenth"], ["new"]),
+        helper.make_node("Add", ["kept", "new"], ["sum"]),
+        helper.make_node("Unsqueeze", ["sum", "zero"], ["h_out"]),
+        helper.make_node("Add", ["c_in", "hundredth"], ["c_out"]),
+    ]
+    constants = {
+        "zero": np.array([0], np.int64),
+        "now": NOW,
+        "then": THEN,
+        "keep": KEEP,
+        "tenth": np.float32(0.1),
+        "hundredth": np.float32(0.01),
+    }
+    graph = helper.make_graph(
+        nodes,
+        "recurrent",
+        [entry("obs", [1, 5]), entry("h_in", [1, 1, 5]), entry("c_in", [1, 1, 1])],
+        [entry("actions", [1, 2]), entry("h_out", [1, 1, 5]), entry("c_out", [1, 1, 1])],
+        [numpy_helper.from_array(np.asarray(value), name) for name, value in constants.items()],
+    )
+    path = tmp_path_factory.mktemp("recurrent") / "e.onnx"
+    opset = [helper.make_opsetid("", 17)]
+    onnx.save(helper.make_model(graph, opset_imports=opset, ir_version=9), path)
+    return path
+
+
+@pytest.fixture(params=["file", "object"])
+def expert(request, file):
+    return file if request.param == "file" else Remembers()
+
+
+def played(seed, steps):
+    """Return the expert's own actions in the toy, remembered by hand."""
+    environment, memory = Integrator(), np.zeros((1, K), np.float32)
+    observation, _ = environment.reset(seed=seed)
+    actions = []
+    for _ in range(steps):
+        action, memory = step(observation[None].astype(np.float32), memory)
+        actions.append(action[0])
+        observation, _, terminated, *_ = environment.step(action[0])
+        if terminated:
+            break
+    return np.array(actions)
+
+
+def test_the_memory_is_carried_and_begins_anew_with_each_episode(expert):
+    opened = load_expert(expert, N, 2)
+    assert (opened.observation_size, opened.memory.size) == (N + K, K)
+    result = fdtasil.distill(expert, TOY, 3, **QUICK, progress=False)
+    states = result.dataset.demonstrations
+    assert states.observations.shape[1] == N + K
+    seeds = fdtasil.seeding.episode_seeds(0, "rollout", 0, 2)
+    for number, seed in enumerate(seeds):
+        mine = states.actions[states.episode == number]
+        assert mine == pytest.approx(played(seed, 20), abs=1e-4)
+
+
+def test_probes_keep_the_memory_and_the_student_sees_none(expert, tmp_path):
+    result = fdtasil.distill(expert, TOY, 3, **QUICK, progress=False)
+    answers = result.dataset.answers
+    assert (answers.displacements[:, N:] == 0).all()
+    assert (answers.displacements[:, :4] != 0).any(axis=0).all()  # the fifth stands still
+    states = result.dataset.demonstrations.observations
+    moved = states[:, None] + answers.displacements[answers.numbers]
+    rows = moved.reshape(-1, N + K)
+    said = answers.values[:, :, 0].reshape(-1, 2)
+    assert said == pytest.approx(step(rows[:, :N], rows[:, N:])[0], abs=1e-4)
+    assert result.student.predict(np.zeros(N, np.float32))[0].shape == (2,)
+    file = result.to_onnx(tmp_path / "s.onnx")
+    again = fdtasil.evaluate(file, expert, TOY, episodes=2, horizon=20, progress=False)
+    assert again.student_return == pytest.approx(result.evaluation.student_return, rel=1e-4)
+
+
+def test_every_row_asked_is_predicted_and_counted(expert):
+    result = fdtasil.distill(expert, TOY, 3, **QUICK, progress=False)
+    asked, predicted = result.report["queries"], result.report["predicted_queries"]
+    assert 0 < asked["remember"] <= predicted["remember"]
+
+
+@pytest.mark.parametrize("trainer", ["dagger", "dart"])
+def test_whoever_acts_the_expert_remembers(trainer, expert):
+    trainer = {"dagger": fdtasil.DAgger((1, 2)), "dart": fdtasil.Dart((1, 2), extra=1)}[trainer]
+    run = {**QUICK, "episodes": 3}
+    result = fdtasil.distill(expert, TOY, 3, trainer=trainer, progress=False, **run)
+    rows = result.dataset.demonstrations.observations
+    assert result.dataset.demonstrations.actions == pytest.approx(
+        step(rows[:, :N], rows[:, N:])[0], abs=1e-4
+    )
+    for number in range(3):
+        mine = rows[result.dataset.demonstrations.episode == number]
+        for before, after in itertools.pairwise(mine):
+            memory = step(before[None, :N], before[None, N:])[1][0]
+            assert after[N:] == pytest.approx(memory, abs=1e-4)
+
+
+def test_a_student_that_sees_less_never_sees_the_memory(expert):
+    run = {**QUICK, "progress": False}
+    some = fdtasil.distill(expert, TOY, 3, student_obs=[0, 3], **run)
+    assert some.student.predict(np.zeros(2, np.float32))[0].shape == (2,)
+    doubled = fdtasil.distill(expert, TOY, 3, student_obs=lambda rows: 2 * rows, **run)
+    assert doubled.student.predict(np.zeros(N, np.float32))[0].shape == (2,)
+    with pytest.raises(SettingError, match="indices from 0 to 4"):
+        fdtasil.distill(expert, TOY, 3, student_obs=[5], **run)
+
+
+def test_an_environment_that_is_passed_in_is_wrapped_too():
+    environment = gymnasium.make(TOY)
+    result = fdtasil.distill(Remembers(), environment, 3, **QUICK, progress=False)
+    expected = fdtasil.distill(Remembers(), TOY, 3, **QUICK, progress=False)
+    assert result.dataset.to_bytes() == expected.dataset.to_bytes()
+
+
+class Stop(Exception):
+    """Stands for a kill."""
+
+
+@pytest.mark.usefixtures("many_checkpoints")
+def test_it_resumes_to_the_byte(expert, tmp_path):
+    run = {**QUICK, "trainer": "dagger", "episodes": 3, "fit": fdtasil.Fit(steps=105)}
+    fdtasil.distill(expert, TOY, 3, out=tmp_path / "whole", progress=False, **run)
+
+    def stop(event):
+        raise Stop
+
+    with pytest.raises(Stop):
+        fdtasil.distill(expert, TOY, 3, out=tmp_path / "run", callback=stop, **run)
+    fdtasil.distill(expert, TOY, 3, resume=tmp_path / "run", progress=False, **run)
+    for name in ("student.safetensors", "demonstrations.npz"):
+        assert (tmp_path / "run" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+
+
+def test_other_names_are_said(file, tmp_path):
+    model = onnx.load(file)
+    for part in (*model.graph.input, *model.graph.output):
+        part.name = {"h_in": "u", "h_out": "v"}.get(part.name, part.name)
+    for node in model.graph.node:
+        node.input[:] = ["u" if name == "h_in" else name for name in node.input]
+        node.output[:] = ["v" if name == "h_out" else name for name in node.output]
+    path = tmp_path / "named.onnx"
+    onnx.save(model, path)
+    opened = load_expert(path, N, 2, memory={"u": "v", "c_in": "c_out"})
+    rows = RANDOM.standard_normal((4, N + K)).astype(np.float32)
+    assert opened.ask(rows, "act") == pytest.approx(step(rows[:, :N], rows[:, N:])[0], abs=1e-5)
+    with pytest.raises(SettingError, match="memory: 'x'"):
+        load_expert(path, N, 2, memory={"x": "v"})
+
+
+def test_what_a_memory_does_not_go_with_is_refused(file, expert):
+    with pytest.raises(SettingError, match="which has a memory"):
+        load_expert(expert, N, 2, workers=2)
+    with pytest.raises(SettingError, match="to be judged"):
+        fdtasil.evaluate(expert, expert, TOY, episodes=1, horizon=5)
+    dataset = fdtasil.distill(Remembers(), TOY, 3, **QUICK, progress=False).dataset
+    with pytest.raises(SettingError, match=r"sizes \(11, 2\)"):
+        fdtasil.distill(expert, TOY, 3, dataset=dataset, progress=False)
