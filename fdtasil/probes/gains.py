@@ -46,7 +46,10 @@ class Gains:
     def relative_error(self) -> float:
         """Norm of the errors as a share of the derivatives' norm, coordinates in their units."""
         sizes = np.sqrt(np.nanmean(self.jacobian**2, axis=0))
-        return float(np.linalg.norm(self.error * self.scale) / np.linalg.norm(sizes * self.scale))
+        error, size = (float(np.linalg.norm(part * self.scale)) for part in (self.error, sizes))
+        if size == 0:
+            return 0.0 if error == 0 else float("inf")
+        return error / size
 
 
 def gains(
@@ -60,7 +63,8 @@ def gains(
 
     The distance is found first, on a ladder of them: the error of a central difference is
     noise / radius at near ones, and curvature * radius^2 at far ones. States without an answer
-    around them have NaN.
+    around them have NaN. At a kink nearer than the radius, as ReLU networks have them, a difference
+    is the mean of both sides, and the estimate does not count that as an error.
 
     Args:
         expert: As in `load_expert`.
