@@ -26,7 +26,7 @@ from fdtasil.experts.sb3.agent import read_agent
 from fdtasil.experts.sb3.trust import Trust
 from fdtasil.experts.sizes import size_hint
 from fdtasil.experts.trial import vouch_for
-from fdtasil.experts.workers import BATCH, check_workers, with_processes, with_threads
+from fdtasil.experts.workers import BATCH, Workers, check_workers, with_processes, with_threads
 from fdtasil.files.onnx.binding import Inputs, check_inputs
 from fdtasil.rollouts.behaviours import Policy
 
@@ -56,7 +56,7 @@ def load_expert(
     memory: Mapping[str, str] | None = None,
     batch: int | None = None,
     trust: Trust = None,
-    workers: int = 0,
+    workers: Workers = 0,
     threads: bool = False,
     timeout: float | None = None,
 ) -> Expert:
@@ -83,7 +83,9 @@ def load_expert(
         trust: "pickle" lets stable-baselines3 load what can't be read from a zip without running
             code that is in it.
         workers: Processes that answer side by side, for slow experts. They start at the first
-            query, hold a copy of the expert each, and compute on one thread.
+            query, hold a copy of the expert each, and compute on one thread. "ray" asks those of
+            a Ray cluster, one for each core ("ray:8" for eight); a batch that is lost with a
+            machine is asked again.
         threads: Use threads of this process instead, for experts that wait or let other threads
             run; those behind HTTP always do.
         timeout: Seconds that a batch may take; a process that hangs is ended. None is for ever,
@@ -127,7 +129,7 @@ def load_expert(
             "one process: what is remembered comes from the step before",
             "leave workers= out",
         )
-    if threads or kind.remote:  # who waits for a server needs no process
+    if isinstance(workers, int) and (threads or kind.remote):  # who waits needs no process
         return with_threads(expert, workers)
     return with_processes(expert, _opener(source, expert, hints), workers, timeout)
 

@@ -63,8 +63,8 @@ def gains(
 
     The distance is found first, on a ladder of them: the error of a central difference is
     noise / radius at near ones, and curvature * radius^2 at far ones. States without an answer
-    around them have NaN. At a kink nearer than the radius, as ReLU networks have them, a difference
-    is the mean of both sides, and the estimate does not count that as an error.
+    around them have NaN. At a kink nearer than the radius, as ReLU networks have them, a
+    difference is the mean of both sides, and the estimate does not count that as an error.
 
     Args:
         expert: As in `load_expert`.

@@ -15,7 +15,10 @@ from fdtasil.experts.workers.handle import WorkerProcess
 from fdtasil.experts.workers.pool import WorkerGroup
 from fdtasil.rollouts.behaviours import Policy
 
-__all__ = ["check_workers", "with_processes", "with_threads"]
+__all__ = ["Workers", "check_workers", "with_processes", "with_threads"]
+
+Workers = int | str
+"""A number, "ray" (a worker for each core of a Ray cluster), or "ray:8"."""
 
 # Rows that a worker is handed at once. A fixed number: which rows are asked together must not
 # depend on how many workers there are, since the last bits of an answer may depend on it.
@@ -23,12 +26,12 @@ BATCH = 8
 
 
 def check_workers(
-    workers: int, threads: bool, timeout: float | None, remote: bool
-) -> tuple[int, float | None]:
+    workers: Workers, threads: bool, timeout: float | None, remote: bool
+) -> tuple[Workers, float | None]:
     """Return how an expert is to be asked: workers and timeout, as plain numbers.
 
     Args:
-        workers: How many processes or threads.
+        workers: How many processes or threads, or those of a Ray cluster.
         threads: Whether they are threads.
         timeout: Seconds for a batch, or None.
         remote: Whether the expert keeps the time itself, as those behind HTTP do.
@@ -36,7 +39,10 @@ def check_workers(
     Raises:
         SettingError: If the arguments don't go together.
     """
-    workers = check_count("workers", workers, least=0)
+    if isinstance(workers, str):
+        _check_ray(workers, threads, remote)
+    else:
+        workers = check_count("workers", workers, least=0)
     if threads and not workers:
         raise SettingError(
             "threads=True with workers=0", "a number of threads", "write workers=2, threads=True"
@@ -53,6 +59,16 @@ def check_workers(
     return workers, timeout
 
 
+def _check_ray(workers: str, threads: bool, remote: bool) -> None:
+    name, colon, count = workers.partition(":")
+    if name != "ray" or (colon and not (count.isascii() and count.isdigit() and int(count))):
+        raise SettingError(f"workers={workers!r}", 'a number, "ray" or "ray:8"', "write workers=4")
+    if threads or remote:
+        other = "threads=True" if threads else "an expert that waits for a server"
+        step = "leave workers= out, or write workers=8" if remote else "leave threads= out"
+        raise SettingError(f"workers={workers!r} with {other}", "one of the two", step)
+
+
 def with_threads(expert: Expert, workers: int) -> Expert:
     """Return the expert, asked by so many threads of this process."""
     askers = [_Thread(expert.answer) for _ in range(workers)]
@@ -60,14 +76,14 @@ def with_threads(expert: Expert, workers: int) -> Expert:
 
 
 def with_processes(
-    expert: Expert, opener: Callable[[], Policy] | None, workers: int, timeout: float | None
+    expert: Expert, opener: Callable[[], Policy] | None, workers: Workers, timeout: float | None
 ) -> Expert:
     """Return the expert, asked by processes that each hold a copy of it.
 
     Args:
         expert: The expert, opened in this process.
         opener: Opens it in another, where it can't be sent as it is; sent by cloudpickle.
-        workers: How many.
+        workers: How many, or "ray".
         timeout: Seconds after which a batch without an answer is an error, or None.
 
     Raises:
@@ -85,6 +101,10 @@ def with_processes(
             "pass the path of an ONNX file or a zip, open what can't be sent inside the function "
             "at its first call, or write threads=True",
         ) from error
+    if isinstance(workers, str):
+        from fdtasil.experts.workers.on_ray import with_ray
+
+        return with_ray(expert, parcel, int(workers.partition(":")[2] or 0) or None, timeout)
     titles = [f"worker {k + 1} of {workers} of {expert.name}" for k in range(workers)]
     askers = [WorkerProcess(title, parcel, timeout) for title in titles]
     return replace(expert, workers=WorkerGroup(askers))

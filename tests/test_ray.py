@@ -1,0 +1,73 @@
+"""Experts asked on a Ray cluster: the bytes of one process, whatever is lost on the way."""
+
+import os
+import signal
+
+import numpy as np
+import pytest
+
+from fdtasil.errors import ExpertError, SettingError
+from fdtasil.experts.load import load_expert
+
+GAIN = np.random.default_rng(0).standard_normal((2, 5)).astype(np.float32)
+ROWS = np.random.default_rng(1).standard_normal((60, 5)).astype(np.float32)
+
+
+@pytest.mark.parametrize(
+    ("workers", "rest"),
+    [("rays", {}), ("ray:", {}), ("ray:0", {}), ("ray:x", {}), ("ray", {"threads": True})],
+    ids=str,
+)
+def test_wrong_workers_are_named(workers, rest):
+    with pytest.raises(SettingError, match="workers='ray"):
+        load_expert(lambda rows: rows, workers=workers, **rest)
+    with pytest.raises(SettingError, match="waits for a server"):
+        load_expert("http://127.0.0.1:1/act", 5, 2, workers="ray")
+
+
+@pytest.fixture(scope="module")
+def cluster():
+    ray = pytest.importorskip("ray")
+    ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False)
+    yield
+    ray.shutdown()
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("cluster")
+def test_the_bytes_are_those_of_one_process_though_a_worker_is_killed(tmp_path):
+    marker = str(tmp_path / "killed")
+
+    def frail(rows):
+        if rows[0, 0] == ROWS[24, 0] and not os.path.exists(marker):
+            open(marker, "w").close()
+            os.kill(os.getpid(), signal.SIGKILL)
+        return np.tanh(rows @ GAIN.T)
+
+    expert = load_expert(frail, 5, 2, workers="ray:2")
+    answers = expert.ask(ROWS, "probe")
+    assert os.path.exists(marker)
+    alone = load_expert(frail, 5, 2, batch=8).ask(ROWS, "probe")
+    assert np.array_equal(answers, alone)
+    assert expert.queries["probe"] == 60
+
+
+@pytest.mark.slow
+@pytest.mark.usefixtures("cluster")
+def test_what_an_expert_raises_there_is_told_here():
+    def limited(rows):
+        if (rows[:, 0] > 1).any():
+            raise ValueError("infeasible")
+        return rows @ GAIN.T
+
+    expert = load_expert(limited, 5, 2, workers="ray")
+    answers = expert.ask(ROWS, "probe")
+    assert np.array_equal(np.isnan(answers).all(axis=1), ROWS[:, 0] > 1)
+
+    del expert  # and with it its cores
+
+    def lost(rows):
+        os._exit(3)
+
+    with pytest.raises(ExpertError, match="lost 3 times with a batch of 8"):
+        load_expert(lost, 5, 2, workers="ray:1").ask(ROWS[:8], "probe")
