@@ -15,6 +15,7 @@ import torch
 from fdtasil.checks import check_choice, check_count, check_flag, check_path, spelt
 from fdtasil.compute import usual_modes
 from fdtasil.errors import ExpertError, FdtasilWarning, SettingError
+from fdtasil.experts.c_expert import open_c
 from fdtasil.experts.expert import CHUNK, Expert, Hints
 from fdtasil.experts.http_expert import is_http_url, open_http
 from fdtasil.experts.hub import fetch, is_hub_uri
@@ -81,7 +82,7 @@ def load_expert(
         batch: Rows asked at once; 1 asks row by row. Left out, it is 1024, 64 over HTTP, 8
             with `workers`: equal batches give equal bytes, whatever the number of workers.
         trust: "pickle" lets stable-baselines3 load what can't be read from a zip without running
-            code that is in it.
+            code that is in it; "c" compiles and runs a C file that fdtasil exported.
         workers: Processes that answer side by side, for slow experts. They start at the first
             query, hold a copy of the expert each, and compute on one thread. "ray" asks those of
             a Ray cluster, one for each core ("ray:8" for eight); a batch that is lost with a
@@ -107,7 +108,7 @@ def load_expert(
         if size is not None:
             check_count(name, size)
     if trust is not None:
-        check_choice("trust", trust, ("pickle",))
+        check_choice("trust", trust, ("pickle", "c"))
     if output is not None and not isinstance(output, str):
         example = "leave it out, or write the name that a viewer of ONNX files shows"
         raise SettingError(spelt("output", output), "the name of an output", example)
@@ -220,7 +221,7 @@ def _from_hub(uri: str | Path, hints: Hints) -> Expert:
 
 
 def _from_agent(path: str | Path, hints: Hints) -> Expert:
-    agent = read_agent(path, trust=hints.trust)
+    agent = read_agent(path, trust=None if hints.trust == "c" else hints.trust)
     return dataclasses.replace(
         ask_as_it_is(agent.module),
         name=Path(path).name,
@@ -264,6 +265,10 @@ def _is_path(source: object) -> bool:
     return isinstance(source, (str, Path))
 
 
+def _is_c(source: object) -> bool:
+    return isinstance(source, (str, Path)) and Path(source).suffix == ".c"
+
+
 def _is_zip(source: object) -> bool:
     return isinstance(source, (str, Path)) and Path(source).suffix == ".zip"
 
@@ -288,6 +293,7 @@ KINDS = (
     Kind(is_http_url, _from_http, remote=True),
     Kind(is_hub_uri, _from_hub),
     Kind(_is_zip, _from_agent),
+    Kind(_is_c, open_c),
     Kind(_is_path, open_onnx),
     Kind(lambda source: isinstance(source, torch.nn.Module), _from_torch),
     Kind(lambda source: isinstance(source, Predictor), _from_predictor),

@@ -96,7 +96,8 @@ class Distilled:
 
         Args:
             path: Ends with ".onnx" (input `obs` (batch, n), output `actions`, normaliser and
-                action bounds inside; `metadata_props` says the rest) or ".safetensors".
+                action bounds inside; `metadata_props` says the rest), ".safetensors", ".c" (C99
+                without malloc; `-DSTUDENT_MAIN` makes it a program of lines) or ".h", its header.
 
         Raises:
             SettingError: If there is no such target.

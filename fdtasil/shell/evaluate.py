@@ -11,12 +11,20 @@ __all__ = ["command"]
 
 
 def _evaluate(
-    expert: str, env: str, output: str | None, inputs: str | None, trust: Any, **arguments: Any
+    policy: str,
+    expert: str,
+    env: str,
+    output: str | None,
+    inputs: str | None,
+    trust: Any,
+    **arguments: Any,
 ) -> None:
     import_module_of(env)
     judge = opened(expert, env, output=output, inputs=inputs, trust=trust)
     assert judge is not None
-    print(evaluate(expert=judge, env=env, **arguments))
+    compiled = policy.endswith(".c")  # the only policy that asks for trust of its own
+    judged = load_expert(policy, trust=trust) if compiled else policy
+    print(evaluate(judged, expert=judge, env=env, **arguments))
 
 
 command = as_command(

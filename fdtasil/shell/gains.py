@@ -28,7 +28,7 @@ def command(
     out: Path | None = None,
     output: str | None = None,
     inputs: str | None = None,
-    trust: Literal["pickle"] | None = None,
+    trust: Literal["pickle", "c"] | None = None,
     horizon: int | None = None,
     seed: int = 0,
 ) -> None:

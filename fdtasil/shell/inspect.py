@@ -28,7 +28,7 @@ def command(
     *,
     output: str | None = None,
     inputs: str | None = None,
-    trust: Literal["pickle"] | None = None,
+    trust: Literal["pickle", "c"] | None = None,
     episodes: int = 5,
     horizon: int | None = None,
     seed: int = 0,

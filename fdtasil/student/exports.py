@@ -5,8 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from fdtasil.errors import SettingError
+from fdtasil.errors import ExportError, SettingError
 from fdtasil.files.onnx.export import check_finite, export_module
+from fdtasil.student.c_source import c_header, c_source, check_parity
+from fdtasil.student.plain import PlainPolicy
 from fdtasil.student.policy import Student
 
 __all__ = ["EXPORTS", "export"]
@@ -20,9 +22,34 @@ def _safetensors(student: Student, states: np.ndarray, metadata: Mapping[str, st
     return student.to_bytes(metadata)
 
 
+def _plain(student: Student) -> PlainPolicy:
+    check_finite(student)
+    plain = student.plain
+    if plain is None:
+        raise ExportError(
+            f"a student of {type(student.architecture).__name__} as C",
+            "fdtasil.Mlp, on the CPU",
+            "export it as .onnx",
+        )
+    return plain
+
+
+def _c(student: Student, states: np.ndarray, metadata: Mapping[str, str]) -> bytes:
+    plain = _plain(student)
+    source = c_source(plain, metadata)
+    check_parity(source, plain, states)
+    return source.encode()
+
+
+def _h(student: Student, states: np.ndarray, metadata: Mapping[str, str]) -> bytes:
+    return c_header(_plain(student)).encode()
+
+
 EXPORTS: dict[str, Writer] = {
     ".onnx": export_module,
     ".safetensors": _safetensors,
+    ".c": _c,
+    ".h": _h,
 }
 """Every target by the suffix of its file."""
 

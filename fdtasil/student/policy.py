@@ -1,6 +1,6 @@
 """The policy that is kept: normalise, network, action bounds; its own file."""
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -14,7 +14,8 @@ from fdtasil.files.border import reads
 from fdtasil.files.onnx.graph import Graph
 from fdtasil.files.tensors import tensors_from_bytes, tensors_to_bytes
 from fdtasil.probes.scales import Scales
-from fdtasil.student.architectures import Architecture, architecture_of, describe
+from fdtasil.student.architectures import Architecture, Mlp, architecture_of, describe
+from fdtasil.student.plain import PlainPolicy
 
 __all__ = ["Student"]
 
@@ -71,6 +72,7 @@ class Student(nn.Module):
         self.register_buffer("_centre", torch.from_numpy(centre).float(), persistent=stored)
         self.register_buffer("_half", torch.from_numpy(half).float(), persistent=stored)
         self._all_bounded = bool(bounded.all())
+        self._plain: tuple[list[int], PlainPolicy | None] | None = None
 
     @property
     def observation_size(self) -> int:
@@ -111,6 +113,31 @@ class Student(nn.Module):
         """(m,) half the range of a bounded action, the deviation of the expert's elsewhere."""
         return self._half
 
+    @property
+    def plain(self) -> PlainPolicy | None:
+        """The same in numpy, with the weights as they are now; None where it is no `Mlp`."""
+        if not isinstance(self.network, nn.Sequential) or not isinstance(self.architecture, Mlp):
+            return None
+        linear = [layer for layer in self.network if type(layer) is nn.Linear]
+        key = [self.mean.data_ptr(), *(layer.weight.data_ptr() for layer in linear)]
+        if self._plain is None or self._plain[0] != key:
+            self._plain = key, self._in_numpy(self.architecture.activation, linear)
+        return self._plain[1]
+
+    def _in_numpy(self, activation: str, linear: Sequence[nn.Linear]) -> PlainPolicy | None:
+        """Return the student in numpy, which shares the memory of the weights."""
+        if self.mean.device.type != "cpu" or self.mean.dtype != torch.float32:
+            return None
+        return PlainPolicy(
+            self.mean.numpy(),
+            self.scale.numpy(),
+            [(one.weight.detach().numpy(), one.bias.detach().numpy()) for one in linear],
+            activation,
+            self._bounded.numpy(),
+            self._centre.numpy(),
+            self._half.numpy(),
+        )
+
     def act(self, observations: np.ndarray) -> np.ndarray:
         """Answer as a policy: (B, n) float32 -> (B, m) float32."""
         return ask_module(self, observations)
@@ -144,6 +171,10 @@ class Student(nn.Module):
                 f"({n},) or (B, {n})",
                 "pass raw observations",
             )
+        # Torch takes longer to begin than the numbers of one row take.
+        plain = self.plain if rows.ndim == 1 or len(rows) == 1 else None
+        if plain is not None:
+            return plain(rows), state
         actions = self.act(np.atleast_2d(rows))
         return (actions[0] if rows.ndim == 1 else actions), state
 

@@ -4,7 +4,7 @@ from typing import Literal
 
 from fdtasil.errors import SettingError
 
-Trust = Literal["pickle"] | None
+Trust = Literal["pickle", "c"] | None
 
 
 def check_trust(trust: Trust) -> None:

@@ -1,0 +1,24 @@
+"""`fdtasil export`: the student of a run as a file for where it will run."""
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from fdtasil.results.distilled import Distilled
+
+__all__ = ["command"]
+
+RunFolder = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+OutFile = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
+
+
+def command(run: RunFolder, file: OutFile) -> None:
+    """Write the student of a run as the file that a suffix asks for.
+
+    Args:
+        run: Folder of a finished run.
+        file: Ends with .onnx, .safetensors, .c (C99 without malloc; compiled and compared with the
+            student where there is a compiler) or .h, its header.
+    """
+    print(f"written: {Distilled.load(run).export(file)}")

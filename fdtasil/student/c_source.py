@@ -1,0 +1,175 @@
+"""A student as C99: no malloc, no file, no library but libm; one function on float arrays."""
+
+import hashlib
+from collections.abc import Mapping
+
+import numpy as np
+
+from fdtasil.errors import ExportError
+from fdtasil.files.compiled import answers_of, compiler
+from fdtasil.student.plain import PlainPolicy
+
+__all__ = ["c_header", "c_source", "check_parity"]
+
+_BEND = {
+    "elu": "x > 0.0f ? x : expm1f(x)",
+    "gelu": "0.5f * x * (1.0f + erff(x * 0.70710678f))",
+    "relu": "x > 0.0f ? x : 0.0f",
+    "silu": "x * (0.5f + 0.5f * tanhf(0.5f * x))",
+    "tanh": "tanhf(x)",
+}
+_A_LINE = 8  # numbers
+_AGREEMENT = 1e-5  # of half the range of an action
+
+
+def c_header(policy: PlainPolicy) -> str:
+    """Return the declarations of a student's C file."""
+    n, m = len(policy.mean), len(policy.centre)
+    return (
+        "/* Written by fdtasil. */\n"
+        "#ifndef STUDENT_H\n#define STUDENT_H\n\n"
+        f"#define STUDENT_OBSERVATIONS {n}\n#define STUDENT_ACTIONS {m}\n\n"
+        "/* Raw observation -> action in the environment's units. Not reentrant: its buffers are\n"
+        "   static. */\n"
+        "void student(const float observation[STUDENT_OBSERVATIONS],\n"
+        "             float action[STUDENT_ACTIONS]);\n\n"
+        "#endif\n"
+    )
+
+
+def c_source(policy: PlainPolicy, about: Mapping[str, str]) -> str:
+    """Return the C file of a student, which `-DSTUDENT_MAIN` makes a program of lines.
+
+    Args:
+        policy: The student.
+        about: Lines of the comment at the top, by name.
+    """
+    widths = [len(policy.mean), *(len(biases) for _, biases in policy.layers)]
+    deep, bend = len(policy.layers) > 1, _BEND_TEXT.format(_BEND[policy.activation])
+    arrays = {"mean": policy.mean, "scale": policy.scale}
+    for number, (weights, biases) in enumerate(policy.layers):
+        arrays |= {f"w{number}": weights, f"b{number}": biases}
+    bounds = {"bounded": policy.bounded, "centre": policy.centre, "half": policy.half}
+    plain = {
+        name: np.asarray(array, np.float32).ravel() for name, array in (arrays | bounds).items()
+    }
+    digest = hashlib.sha256(b"".join(array.tobytes() for array in plain.values())).hexdigest()
+    count, widest = sum(map(np.size, plain.values())), max(widths)
+    comment = {
+        **about,
+        "layers": " -> ".join(map(str, widths)) + f", {policy.activation}",
+        "numbers": f"{count:,} float constants, {(1 + deep) * widest} floats of static memory",
+        "sha256": f"{digest} of the constants",
+    }
+    lines = "\n".join(f"   {name}: {_plainly(text)}" for name, text in comment.items())
+    calls = [_call(number, len(widths) - 2) for number in range(len(widths) - 1)]
+    declared = c_header(policy).partition("*/\n")[2]
+    return "\n".join(
+        [
+            f"/* Written by fdtasil. C99, -lm.\n{lines}\n*/",
+            declared,
+            "#include <math.h>\n",
+            *(_array(name, array) for name, array in plain.items()),
+            f"static float first[{widest}];\n",
+            *([f"static float second[{widest}];\n", bend] if deep else []),
+            _LINEAR,
+            "void student(const float observation[STUDENT_OBSERVATIONS],\n"
+            "             float action[STUDENT_ACTIONS])\n{",
+            "    int i;\n    float raw[STUDENT_ACTIONS];",
+            "    for (i = 0; i < STUDENT_OBSERVATIONS; i++)",
+            "        first[i] = (observation[i] - mean[i]) / scale[i];",
+            *(
+                call.format(inputs=a, outputs=b)
+                for call, a, b in zip(calls, widths, widths[1:], strict=False)
+            ),
+            "    for (i = 0; i < STUDENT_ACTIONS; i++)",
+            "        action[i] = centre[i]\n"
+            "            + half[i] * (bounded[i] > 0.0f ? tanhf(raw[i]) : raw[i]);\n}\n",
+            _MAIN,
+        ]
+    )
+
+
+def _plainly(text: str) -> str:
+    """Return a text that ends no comment."""
+    return "".join(c if c.isprintable() else "?" for c in text).replace("*", "?")[:200]
+
+
+def _array(name: str, values: np.ndarray) -> str:
+    # Nine digits read back as the same float32.
+    numbers = [_number(value) for value in values]
+    rows = [", ".join(numbers[i : i + _A_LINE]) for i in range(0, len(numbers), _A_LINE)]
+    return f"static const float {name}[{len(values)}] = {{\n" + ",\n".join(rows) + "};\n"
+
+
+def _number(value: float) -> str:
+    text = f"{float(value):.9g}"
+    return text + ("f" if set(text) & set(".e") else ".0f")
+
+
+def _call(number: int, last: int) -> str:
+    source, target = ("first", "second") if number % 2 == 0 else ("second", "first")
+    if number == last:
+        target = "raw"
+    line = f"    linear(w{number}, b{number}, {source}, {target}, {{inputs}}, {{outputs}});"
+    return line if number == last else f"{line}\n    bend({target}, {{outputs}});"
+
+
+_BEND_TEXT = """static void bend(float *values, int count)
+{{
+    int i;
+    for (i = 0; i < count; i++) {{
+        const float x = values[i];
+        values[i] = {};
+    }}
+}}
+"""
+_LINEAR = """static void linear(const float *weights, const float *biases, const float *input,
+                   float *output, int inputs, int outputs)
+{
+    int i, j;
+    for (i = 0; i < outputs; i++) {
+        float sum = biases[i];
+        for (j = 0; j < inputs; j++)
+            sum += weights[i * inputs + j] * input[j];
+        output[i] = sum;
+    }
+}
+"""
+_MAIN = """#ifdef STUDENT_MAIN
+#include <stdio.h>
+/* Reads observations, numbers with spaces between, and writes a line of actions for each. */
+int main(void)
+{
+    float observation[STUDENT_OBSERVATIONS], action[STUDENT_ACTIONS];
+    int i;
+    for (;;) {
+        for (i = 0; i < STUDENT_OBSERVATIONS; i++)
+            if (scanf("%f", &observation[i]) != 1)
+                return 0;
+        student(observation, action);
+        for (i = 0; i < STUDENT_ACTIONS; i++)
+            printf("%.9g%c", (double)action[i], i + 1 < STUDENT_ACTIONS ? ' ' : '\\n');
+        fflush(stdout);
+    }
+}
+#endif
+"""
+
+
+def check_parity(source: str, policy: PlainPolicy, states: np.ndarray) -> None:
+    """Compile a student's own C file and compare it with the student, where there is a compiler.
+
+    Raises:
+        ExportError: If it can't be compiled, or its answers differ.
+    """
+    if compiler() is None:
+        return
+    answers = answers_of(source, "STUDENT_MAIN", states)
+    difference = float(np.abs((answers - policy(states)) / policy.half).max())
+    if not difference <= _AGREEMENT:
+        raise ExportError(
+            f"the C file and the student differ by {difference:.1e} of half the range",
+            f"at most {_AGREEMENT:g} on {len(states)} states",
+            "look for weights of very different sizes",
+        )

@@ -1,0 +1,175 @@
+"""A student as C and in numpy: the same answers, and nothing that a board does not have."""
+
+import pickle
+import subprocess
+
+import numpy as np
+import pytest
+import torch
+from conftest import TOY, mlp_onnx
+from test_student import make
+
+import fdtasil
+from fdtasil.errors import ExpertError, ExportError, SettingError
+from fdtasil.files.compiled import compiler
+from fdtasil.student.architectures import ACTIVATIONS
+from fdtasil.student.c_source import c_source, check_parity
+from fdtasil.student.exports import export
+from fdtasil.student.plain import PLAIN
+
+needs_a_compiler = pytest.mark.skipif(compiler() is None, reason="needs a C compiler")
+NEAR = 5 + 2 * np.random.default_rng(0).standard_normal((1000, 3)).astype(np.float32)
+FAR = 10 * np.random.default_rng(1).standard_normal((1000, 3)).astype(np.float32)
+
+
+def built(source, folder, *flags):
+    file, program = folder / "student.c", folder / "student"
+    file.write_bytes(source)
+    strict = ["-std=c99", "-Wall", "-Wextra", "-Wconversion", "-Werror", "-pedantic", "-O2"]
+    command = [compiler(), *strict, *flags, "-DSTUDENT_MAIN", "-o", program, file, "-lm"]
+    done = subprocess.run(command, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return program
+
+
+def asked(program, rows):
+    lines = "\n".join(" ".join(f"{x:.9g}" for x in row) for row in rows)
+    done = subprocess.run([program], input=lines, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    return np.array([line.split() for line in done.stdout.splitlines()], np.float64)
+
+
+@needs_a_compiler
+@pytest.mark.parametrize("activation", ACTIVATIONS)
+@pytest.mark.parametrize("hidden", [(), (8,), (64, 32, 16)], ids=str)
+def test_compiled_it_answers_as_the_student(hidden, activation, tmp_path):
+    student = make(hidden, activation)
+    program = built(export(student, NEAR, {"environment": "Toy-v0"}, "s.c"), tmp_path)
+    half = student.plain.half
+    for rows in (NEAR, FAR):
+        with torch.no_grad():
+            expected = student(torch.from_numpy(rows)).numpy()
+        assert np.abs((asked(program, rows) - expected) / half).max() < 1e-5
+
+
+@needs_a_compiler
+def test_a_sanitiser_finds_nothing_and_no_memory_is_asked_for(tmp_path):
+    source = export(make((32, 32)), NEAR, {}, "student.c")
+    program = built(source, tmp_path, "-fsanitize=address,undefined", "-fno-sanitize-recover")
+    assert asked(program, FAR[:50]).shape == (50, 2)
+    object_ = tmp_path / "student.o"
+    file = tmp_path / "student.c"
+    subprocess.run([compiler(), "-std=c99", "-O2", "-c", "-o", object_, file], check=True)
+    symbols = subprocess.run(["nm", object_], capture_output=True, text=True).stdout
+    undefined = {line.split()[-1] for line in symbols.splitlines() if " U " in line}
+    assert undefined <= {"tanhf", "erff", "expm1f"}
+    shown = {line.split()[-1] for line in symbols.splitlines() if " T " in line}
+    assert shown == {"student"}
+
+
+@needs_a_compiler
+def test_the_header_fits(tmp_path):
+    student = make((8,))
+    (tmp_path / "student.h").write_bytes(export(student, NEAR, {}, "student.h"))
+    (tmp_path / "student.c").write_bytes(export(student, NEAR, {}, "student.c"))
+    (tmp_path / "robot.c").write_text(
+        '#include "student.h"\n'
+        "float robot(void) { float x[STUDENT_OBSERVATIONS] = {0}, u[STUDENT_ACTIONS];\n"
+        "student(x, u); return u[STUDENT_ACTIONS - 1]; }\n"
+    )
+    files = [tmp_path / "robot.c", tmp_path / "student.c"]
+    subprocess.run(
+        [compiler(), "-std=c99", "-Wall", "-Werror", "-c", *files], cwd=tmp_path, check=True
+    )
+
+
+@needs_a_compiler
+def test_unbounded_actions_are_linear(tmp_path):
+    student = make((16,), low=(-np.inf, -1.0), high=(np.inf, 1.0))
+    program = built(export(student, NEAR, {}, "student.c"), tmp_path)
+    assert asked(program, FAR) == pytest.approx(student.act(FAR), rel=1e-5, abs=1e-5)
+
+
+@needs_a_compiler
+def test_a_comment_ends_where_it_should(tmp_path):
+    built(export(make((4,)), NEAR, {"name": "*/ int main; /*\n#error"}, "student.c"), tmp_path)
+
+
+@needs_a_compiler
+def test_a_file_that_answers_otherwise_is_refused():
+    plain = make((8,)).plain
+    wrong = c_source(plain, {}).replace("input[j];", "input[0];")
+    with pytest.raises(ExportError, match="differ by"):
+        check_parity(wrong, plain, NEAR)
+    with pytest.raises(ExportError, match="can't compile"):
+        check_parity("int main(", plain, NEAR)
+
+
+def test_weights_that_are_not_finite_are_refused():
+    student = make((8,))
+    with torch.no_grad():
+        student.network[0].weight[0, 0] = torch.nan
+    with pytest.raises(ExportError, match="not finite"):
+        export(student, NEAR, {}, "student.c")
+    with pytest.raises(SettingError, match=r"\.onnx or \.safetensors or \.c or \.h"):
+        export(student, NEAR, {}, "student.exe")
+
+
+def test_every_activation_is_there_in_all_three():
+    assert PLAIN.keys() == ACTIVATIONS.keys()
+    x = np.linspace(-12, 12, 4001, dtype=np.float32)
+    for name, bend in PLAIN.items():
+        expected = ACTIVATIONS[name]()(torch.from_numpy(x)).numpy()
+        assert bend(x) == pytest.approx(expected, abs=2e-6), name
+
+
+def test_one_row_is_answered_in_numpy_with_the_weights_as_they_are():
+    rows = NEAR
+    student = make((32, 16))
+    for _ in range(3):
+        expected = student.act(rows[:1])
+        assert student.predict(rows[:1])[0] == pytest.approx(expected, abs=1e-5)
+        assert student.predict(rows[0])[0] == pytest.approx(expected[0], abs=1e-5)
+        with torch.no_grad():
+            student.network[0].weight += 0.1
+    student.network[2] = torch.nn.Linear(32, 16, device="meta").to_empty(device="cpu")
+    torch.nn.init.zeros_(student.network[2].weight)
+    torch.nn.init.ones_(student.network[2].bias)
+    assert student.predict(rows[0])[0] == pytest.approx(student.act(rows[:1])[0], abs=1e-5)
+
+
+@needs_a_compiler
+def test_the_compiled_code_is_judged_in_the_loop(quick, linear, tmp_path):
+    path = quick.export(tmp_path / "student.c")
+    with pytest.raises(ExpertError, match=r"compiled and run here"):
+        fdtasil.evaluate(path, linear, TOY, episodes=2)
+    policy = fdtasil.load_expert(path, trust="c")
+    judged = fdtasil.evaluate(policy, linear, TOY, episodes=2)
+    expected = fdtasil.evaluate(quick.student, linear, TOY, episodes=2)
+    assert judged.student_return == pytest.approx(expected.student_return, rel=1e-4)
+    again = pickle.loads(pickle.dumps(policy.answer))
+    rows = quick.demonstrations.observations[:20]
+    assert np.array_equal(again(rows), policy.ask(rows, "act"))
+
+
+@needs_a_compiler
+def test_from_a_shell(quick_folder, inside, tmp_path):
+    out = tmp_path / "student.c"
+    done = inside("export", quick_folder, out)
+    assert done.returncode == 0, done.stderr
+    assert f"written: {out}" in done.stdout
+    assert "#define STUDENT_OBSERVATIONS 5" in out.read_text()
+    expert = mlp_onnx(tmp_path / "e.onnx")
+    line = ("evaluate", out, TOY, "--expert", expert, "--episodes", 2, "--horizon", 10)
+    assert "your permission" in inside(*line).stderr
+    judged = inside(*line, "--trust", "c")
+    assert judged.returncode == 0, judged.stderr
+    assert "normalised return" in judged.stdout
+
+
+def test_a_c_file_of_others_is_refused(tmp_path):
+    (tmp_path / "other.c").write_text("int main(void) { return 0; }\n")
+    with pytest.raises(ExpertError, match="does not say its sizes"):
+        fdtasil.load_expert(tmp_path / "other.c", trust="c")
+    with pytest.raises(ExpertError, match="your permission"):
+        fdtasil.load_expert(tmp_path / "other.c")
