@@ -115,7 +115,14 @@ def test_every_argument_is_explained(name, inside, monkeypatch):
     for argument, parameter in inspect.signature(module.command).parameters.items():
         if parameter.kind is not inspect.Parameter.POSITIONAL_ONLY:
             flag = f"--{argument.replace('_', '-')}"
-            assert flag in text or argument in ("expert", "env", "policy", "agent_zip", "run", "file"), argument
+            assert flag in text or argument in (
+                "expert",
+                "env",
+                "policy",
+                "agent_zip",
+                "run",
+                "file",
+            ), argument
     if name == "distill":
         assert "States in a minibatch at most" in text
         assert "Width of each hidden layer" in text
