@@ -38,10 +38,13 @@ CONTROLLERS = {
         name: Controller(OWN / f"{name}.onnx", name)
         for name in ("HalfCheetah-v5", "Walker2d-v5", "Ant-v5", "Humanoid-v5", "Swimmer-v5")
     },
+    "Reacher-v5": Controller(OWN / "Reacher-v5.onnx", "Reacher-v5"),
 }
 """By the name that results and figures use; `paper/` marks the experts of the TaSIL paper."""
+_COMMANDED = ("Reacher-v5",)
 
 
 def available(*names: str) -> list[str]:
-    """Return those of the names whose files are here; without names all of them."""
-    return [name for name in names or CONTROLLERS if CONTROLLERS[name].path.exists()]
+    """Return those of the names whose files are here; without names all that move on their own."""
+    chosen = names or [name for name in CONTROLLERS if name not in _COMMANDED]
+    return [name for name in chosen if CONTROLLERS[name].path.exists()]
