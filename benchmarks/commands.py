@@ -1,4 +1,4 @@
-"""A command that stands still within an episode: what one to ten demonstrations teach of others."""
+"""A command that stands still in an episode: what one to ten demonstrations teach of others."""
 
 from collections.abc import Sequence
 from typing import Any
