@@ -13,6 +13,7 @@ from toy_environments import Integrator
 import fdtasil
 from fdtasil.errors import SettingError
 from fdtasil.experts.load import load_expert
+from fdtasil.student.schedule import Schedule
 
 pytestmark = pytest.mark.usefixtures("no_pictures")
 
@@ -214,3 +215,19 @@ def test_what_a_memory_does_not_go_with_is_refused(file, expert):
     dataset = fdtasil.distill(Remembers(), TOY, 3, **QUICK, progress=False).dataset
     with pytest.raises(SettingError, match=r"sizes \(11, 2\)"):
         fdtasil.distill(expert, TOY, 3, dataset=dataset, progress=False)
+
+
+def test_a_student_that_can_not_follow_is_named(monkeypatch):
+    """The action is the memory alone, of which the observation says nothing."""
+    monkeypatch.setattr(Schedule, "total_steps", lambda schedule, states: 40)
+
+    class Clock(Remembers):
+        def predict(self, observation, state=None, episode_start=None, deterministic=False):
+            _, after = super().predict(observation, state, episode_start)
+            clock = after[1][0]
+            return np.concatenate([np.sin(50 * clock), np.cos(50 * clock)], axis=1), after
+
+    run = {name: value for name, value in QUICK.items() if name != "fit"}
+    with pytest.warns(fdtasil.FdtasilWarning, match="does not see the expert's memory") as caught:
+        fdtasil.distill(Clock(), TOY, 3, **run, progress=False)
+    assert any("fdtasil.Fit(steps=80)" in str(one.message) for one in caught)

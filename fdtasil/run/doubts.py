@@ -7,14 +7,16 @@ import numpy as np
 from fdtasil.demonstrations.states import Demonstrations
 from fdtasil.errors import warn
 from fdtasil.probes.spread import stands_still
+from fdtasil.rollouts.behaviours import Policy
 from fdtasil.rollouts.episodes import Episodes
 from fdtasil.rollouts.survivors import SURVIVORS
 from fdtasil.run.lesson import Lesson
 
-__all__ = ["warn_of_falls", "warn_of_silence", "warn_of_still_coordinates"]
+__all__ = ["warn_of_falls", "warn_of_misfit", "warn_of_silence", "warn_of_still_coordinates"]
 
 _FEW = 5  # demonstrations, of which each counts
 _USUALLY = 0.75  # share of the expert's episodes that it survives
+_MISFIT = 0.15  # share of the actions' deviation; students of the experts here reach 0.01
 _SHOWN = 8  # coordinates named in a warning
 
 
@@ -53,6 +55,28 @@ def warn_of_silence(shares: Mapping[str, float], reason: str, given_up: int) -> 
         f"the expert had no answer to some rows (shares: {where}), which are left out{ended}; the "
         f"last time it said {reason}"
     )
+
+
+def warn_of_misfit(lesson: Lesson, student: Policy, steps: int, *, remembers: bool) -> None:
+    """Warn of a student that does not even repeat what it was shown.
+
+    Args:
+        lesson: What was learnt from.
+        student: Who learnt it.
+        steps: How long it was trained, as the library chose it.
+        remembers: Whether the expert has a memory.
+    """
+    states = lesson.dataset.demonstrations
+    said, own = states.actions, student(states.observations)
+    deviation = float(np.linalg.norm(said - said.mean(axis=0), axis=1).mean())
+    error = float(np.linalg.norm(own - said, axis=1).mean())
+    if deviation > 0 and error > _MISFIT * deviation:
+        cause = "it does not see the expert's memory" if remembers else "it may see too little"
+        warn(
+            f"at the demonstrated states the student's actions are off by {error / deviation:.0%} "
+            f"of what the expert's vary by: {cause}, or want more than {steps:,} steps "
+            f"(fit=fdtasil.Fit(steps={2 * steps}))"
+        )
 
 
 def warn_of_still_coordinates(lesson: Lesson, expert: Episodes) -> None:

@@ -29,7 +29,7 @@ from fdtasil.run.asking import Asking
 from fdtasil.run.checkpoints import Checkpoints
 from fdtasil.run.collecting import Collecting
 from fdtasil.run.configuration import Configuration
-from fdtasil.run.doubts import warn_of_silence
+from fdtasil.run.doubts import warn_of_misfit, warn_of_silence
 from fdtasil.run.events import Callback, Event, tell_all
 from fdtasil.run.folder import asked_anew, open_run_folder
 from fdtasil.run.interrupts import heard_interrupts
@@ -321,6 +321,9 @@ def _complete(
             )
             about = int(last["round"]), trained.steps, last
             rounds.training.callback(Event("evaluation", *about, student, evaluation))
+        if run.fit.steps is None and run.fit.epochs is None:  # else the caller chose the length
+            act, steps = lesson.view.policy(student.act), trained.steps
+            warn_of_misfit(lesson, act, steps, remembers=subject.remembered > 0)
         _ask_again(run, subject.expert, theirs, lesson)
         if subject.expert is not None:
             shares, ended = no_answer(checkpoints.account), lesson.collected.counts
