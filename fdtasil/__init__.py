@@ -42,6 +42,7 @@ if TYPE_CHECKING:
     from fdtasil.run.pipeline import distill, evaluate
     from fdtasil.student.architectures import Mlp
     from fdtasil.student.fit import Fit
+    from fdtasil.student.history import History
     from fdtasil.student.policy import Student
 
 __all__ = [
@@ -55,6 +56,7 @@ __all__ = [
     "FdtasilError",
     "FdtasilWarning",
     "Fit",
+    "History",
     "Log",
     "Mlp",
     "NoisyExpert",
@@ -85,6 +87,7 @@ _ROOMS = {
     "run.pipeline": ("distill", "evaluate"),
     "student.architectures": ("Mlp",),
     "student.fit": ("Fit",),
+    "student.history": ("History",),
     "student.policy": ("Student",),
 }
 _HOME = {name: room for room, names in _ROOMS.items() for name in names}

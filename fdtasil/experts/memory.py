@@ -4,15 +4,16 @@ What is carried depends on what was observed, not on who acts. So an expert with
 without, of longer observations, in an environment that says what it would remember.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import torch
 
 from fdtasil.rollouts.behaviours import Policy
 
-__all__ = ["Memory", "Step", "stateless"]
+__all__ = ["AnswersOnColumns", "Memory", "OnColumns", "Step", "stateless"]
 
 Step = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 """(B, n) observations and (B, k) memories -> (B, m) actions, and the memories after them."""
@@ -49,3 +50,32 @@ class _Stateless:
     def __call__(self, rows: np.ndarray) -> Any:
         n = self.observation_size
         return self.step(rows[:, :n], rows[:, n:])[0]
+
+
+class OnColumns(torch.nn.Module):
+    """A module that is given some columns of an observation.
+
+    Args:
+        module: The module.
+        columns: Which.
+    """
+
+    def __init__(self, module: torch.nn.Module, columns: Sequence[int]) -> None:
+        super().__init__()
+        self.module, self.columns = module, list(columns)
+
+    def forward(self, rows: torch.Tensor) -> torch.Tensor:
+        """(B, n) -> (B, m)."""
+        return self.module(rows[:, self.columns])
+
+
+@dataclass(frozen=True)
+class AnswersOnColumns:
+    """A policy that is given some columns of an observation."""
+
+    answer: Policy
+    columns: tuple[int, ...]
+
+    def __call__(self, rows: np.ndarray) -> np.ndarray:
+        """(B, n) -> (B, m)."""
+        return self.answer(np.ascontiguousarray(rows[:, list(self.columns)]))

@@ -116,6 +116,7 @@ class Arguments:
             usual_radius=self.preset.radius,
             probes_given=stored,
             observation_size=subject.observation_size,
+            past=subject.past,
             remembered=subject.remembered,
             student_obs=describe_view(self.student_obs, subject.observation_size),
             student=self.student or usual_architecture(anew=bool(source and source.resample)),

@@ -53,6 +53,7 @@ class Configuration:
         fingerprint: Of the environment; see `rollouts/trials.py`. None where there is none, or it
             does not repeat itself.
         reason: How often probes are asked and why, where no caller says which they are.
+        past: Length of the past that the student sees.
         remembered: Length of the expert's memory; 0 where it has none.
     """
 
@@ -81,7 +82,14 @@ class Configuration:
     spread: Spread
     fingerprint: dict[str, Any] | None
     reason: str | None
+    past: int = 0
     remembered: int = 0
+
+    @property
+    def held(self) -> range:
+        """The coordinates that the student sees and probes do not move: the past."""
+        stop = self.observation_size - self.remembered
+        return range(stop - self.past, stop)
 
     def predicted_queries(self) -> dict[str, int]:
         """Return the rows that the run will ask the expert for, by purpose.

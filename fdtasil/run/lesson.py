@@ -1,6 +1,6 @@
 """What a round learns from, with what is computed of it once."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -34,6 +34,7 @@ class Lesson:
         student_obs: StudentObservation | None,
         before: "Lesson | None",
         spread: Spread,
+        held: range,
     ) -> "Lesson":
         """Return the lesson of what is collected.
 
@@ -42,6 +43,7 @@ class Lesson:
             student_obs: What the student sees.
             before: That of the round before, whose view it has; None in the first round.
             spread: How far coordinates will go that hardly move.
+            held: Coordinates that no probe moves.
 
         Raises:
             SettingError: If the student can't see so.
@@ -49,6 +51,8 @@ class Lesson:
         states = collected.dataset.demonstrations
         first = states.observations[states.round == 0][:256]
         view = View.of(student_obs, first) if before is None else before.view
+        if held:
+            view = replace(view, seen=view.seen & ~np.isin(np.arange(len(view.seen)), held))
         scales = measure_scales(states.observations, view.seen)
         told = spread.among(states.observations, states.episode)
         return cls(collected, view, scales.spread_by(told))

@@ -23,6 +23,7 @@ from fdtasil.results.evaluation import Constraints, Evaluation, check_constraint
 from fdtasil.rollouts.behaviours import follow, follow_answers
 from fdtasil.rollouts.environments import EnvironmentLike, EnvironmentPool, resolve_horizon
 from fdtasil.rollouts.episodes import Episodes
+from fdtasil.rollouts.history import past_size
 from fdtasil.run.account import Account
 from fdtasil.run.arguments import read_arguments
 from fdtasil.run.asking import Asking
@@ -57,6 +58,7 @@ def distill(
     seed: int = 0,
     student: Architecture | None = None,
     student_obs: StudentObservation | None = None,
+    history: int = 1,
     keep: str = "all",
     spread: SpreadLike | None = None,
     fit: Fit | None = None,
@@ -106,6 +108,9 @@ def distill(
             hidden layers of 512, or of 256 where the expert is asked anew.
         student_obs: Indices of the coordinates that the student sees, or a function
             (B, n) -> (B, k); the expert sees all. Probes move only what the student sees.
+        history: How many observations the student sees, with the actions between them; more than
+            one for an expert with a memory, or an environment that hides speeds. Probes move the
+            present one. `fdtasil.History` keeps them where the student runs.
         keep: Which of the expert's own episodes are learnt from: "all", or "survivors", which
             records others (three at most) in the place of each that the environment ended.
         spread: How far coordinates will go on the machine that stand still in the demonstrations,
@@ -159,6 +164,7 @@ def distill(
     """
     folder, force = _folder_of(out, resume), check_flag("force", force)
     limits = None if constraints is None else check_constraints(constraints)
+    history = check_history(history, student_obs)
     progress = check_flag("progress", progress)
     given = None if dataset is None else load_dataset(dataset)
     arguments = read_arguments(
@@ -179,9 +185,9 @@ def distill(
         device=device,
     )
     chosen, told = pick_device(arguments.device), tell_all(callback)
-    with heard_warnings() as notes, open_subject(expert, env, given) as subject:
+    with heard_warnings() as notes, open_subject(expert, env, given, history) as subject:
         going_on = asked_anew(folder) if folder is not None and resume is not None else None
-        student_obs = visible(student_obs, subject.expert, subject.observation_size)
+        student_obs = visible(student_obs, subject.observation_size, subject.remembered)
         arguments = replace(arguments, student_obs=student_obs)
         run, bars = arguments.configure(subject, going_on), Progress(progress)
         run.check_spread()
@@ -214,6 +220,7 @@ def evaluate(
     horizon: int | None = None,
     seed: int = 0,
     student_obs: StudentObservation | None = None,
+    history: int = 1,
     constraints: Constraints | None = None,
     force: bool = False,
     progress: bool = True,
@@ -230,6 +237,7 @@ def evaluate(
         seed: Of the starts; those of `distill` with the same seed.
         student_obs: What the policy sees, as in `distill`; an ONNX file that fdtasil exported
             says its indices itself.
+        history: As in `distill`.
         constraints: As in `distill`.
         force: Go on with a warning where the expert fails the gate but answers.
         progress: Show progress bars, where there is a terminal.
@@ -250,27 +258,44 @@ def evaluate(
     check_count("seed", seed, 0, 2**32 - 1)
     force = check_flag("force", force)
     limits = None if constraints is None else check_constraints(constraints)
+    history = check_history(history, student_obs)
     count, bars = check_count("episodes", episodes), Progress(check_flag("progress", progress))
     with EnvironmentPool(env) as pool, torch_settings(torch.device("cpu")):
         n, m = pool.boxes.observation_size, pool.boxes.action_size
         black_box, length = load_expert(expert, n, m), resolve_horizon(horizon, pool)
-        judged = open_expert(policy, Hints(view_size(student_obs, n), m))
+        own = n + past_size(history, n, m)
+        judged = open_expert(policy, Hints(view_size(student_obs, own), m))
         if judged.memory is not None:
             raise SettingError(
                 f"{judged.name}, which has a memory, to be judged",
                 "a policy without one",
                 "compare it as the expert: evaluate(student, it, env)",
             )
-        n += carry(black_box, pool)
+        black_box, past, remembered = carry(black_box, pool, history)
+        n += past + remembered
         starts = episode_seeds(seed, "evaluation", 0, count)
         most = large_batch(count, black_box.chunk)
         theirs = examine(black_box, pool, starts, length, bars, force=force, largest=most)
         student_obs = judged.columns if student_obs is None else student_obs
-        seen = visible(student_obs, black_box, n)
+        seen = visible(student_obs, n, remembered)
         view = View.of(seen, theirs.observations[theirs.valid][:256])
         answer = view.policy(sized(judged, view.size, m).policy("evaluate"))
         acting = follow_answers(answer)
         return evaluate_pair(acting, black_box, theirs, pool, length, seed, bars, limits)
+
+
+def check_history(history: object, student_obs: object) -> int:
+    """Return the number of observations that a student sees.
+
+    Raises:
+        SettingError: If it can't be used.
+    """
+    count = check_count("history", history)
+    if count > 1 and student_obs is not None:
+        raise SettingError(
+            f"history={count} with student_obs=", "one of the two", "leave one of them out"
+        )
+    return count
 
 
 def _folder_of(out: str | Path | None, resume: str | Path | None) -> Path | None:

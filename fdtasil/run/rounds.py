@@ -113,7 +113,11 @@ class Rounds:
             return made[0].collected
 
         collected = self._once(round_, COLLECTED, collect)
-        return made[0] if made else Lesson.of(collected, self.student_obs, lesson, self.run.spread)
+        return (
+            made[0]
+            if made
+            else Lesson.of(collected, self.student_obs, lesson, self.run.spread, self.run.held)
+        )
 
     def _recorded(
         self,
@@ -156,7 +160,7 @@ class Rounds:
             joined = before.dataset.demonstrations + states
             whole = replace(new, dataset=replace(before.dataset, demonstrations=joined))
             old = before.dataset.answers
-        around = Lesson.of(whole, self.student_obs, lesson, self.run.spread)
+        around = Lesson.of(whole, self.student_obs, lesson, self.run.spread, self.run.held)
         if self.run.probes is None:
             return around
         answers = self._answers(round_, states.observations, around)

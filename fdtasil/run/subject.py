@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -10,7 +10,9 @@ from fdtasil.demonstrations.dataset import Dataset
 from fdtasil.errors import SettingError
 from fdtasil.experts.expert import Expert
 from fdtasil.experts.load import ExpertLike, load_expert
+from fdtasil.experts.memory import AnswersOnColumns, OnColumns
 from fdtasil.rollouts.environments import EnvironmentLike, EnvironmentPool
+from fdtasil.rollouts.history import WithHistory, past_size
 from fdtasil.rollouts.remembering import Remembering
 from fdtasil.student.view import StudentObservation, describe_view
 
@@ -25,8 +27,9 @@ class Subject:
         expert: The black box, or None where nobody is asked.
         pool: The environment, or None where nothing is recorded.
         environment: What to call it.
-        observation_size: n; with what the expert remembers behind the environment's own.
+        observation_size: n; behind the environment's own stand past and memory.
         action_size: m.
+        past: Length of the past that the student sees.
         remembered: Length of the expert's memory; 0 where it has none.
     """
 
@@ -35,6 +38,7 @@ class Subject:
     environment: str
     observation_size: int
     action_size: int
+    past: int = 0
     remembered: int = 0
 
     @property
@@ -48,8 +52,15 @@ def open_subject(
     expert: ExpertLike | None,
     env: EnvironmentLike | None,
     given: Dataset | None,
+    history: int = 1,
 ) -> Iterator[Subject]:
     """Open expert and environment for the length of a block.
+
+    Args:
+        expert: The expert.
+        env: The environment.
+        given: A dataset.
+        history: How many observations the student sees.
 
     Raises:
         SettingError: If something is missing that nothing replaces.
@@ -73,50 +84,71 @@ def open_subject(
                 f"{(n, m)}, as {name}",
                 "pass the environment that they were recorded in, or none",
             )
-        opened, remembered = None, 0
+        opened, past, remembered = None, 0, 0
         if expert is not None:
-            opened = load_expert(expert, n, m)
-            remembered = carry(opened, pool)
-        yield Subject(opened, pool, name, n + remembered, m, remembered)
+            opened, past, remembered = carry(load_expert(expert, n, m), pool, history)
+        yield Subject(opened, pool, name, n + past + remembered, m, past, remembered)
 
 
-def carry(expert: Expert, pool: EnvironmentPool | None) -> int:
-    """Let an environment show what an expert would remember; return how many numbers that is.
+def carry(
+    expert: Expert, pool: EnvironmentPool | None, history: int = 1
+) -> tuple[Expert, int, int]:
+    """Let an environment show what an expert would remember, and what a student is to see.
+
+    Args:
+        expert: The expert.
+        pool: The environment, whose observations become longer: its own, those of the past with
+            the actions then, and the expert's memory.
+        history: How many observations the student sees.
+
+    Returns:
+        The expert, which takes its part of them, and the lengths of past and memory.
 
     Raises:
         SettingError: If there is no environment, and so nothing to remember.
     """
-    if expert.memory is None:
-        return 0
-    if pool is None:
-        raise SettingError(
-            f"{expert.name}, which has a memory, without an environment",
-            "an environment, in which it remembers",
-            "pass env=",
-        )
     memory = expert.memory
+    if memory is None and history == 1:
+        return expert, 0, 0
+    if pool is None:
+        what = f"history={history}" if memory is None else f"{expert.name}, which has a memory,"
+        raise SettingError(
+            f"{what} without an environment", "one in which it is remembered", "pass env="
+        )
+    n, m = pool.boxes.observation_size, pool.boxes.action_size
+    past, remembered = past_size(history, n, m), memory.size if memory else 0
+    if past:
+        pool.wrap(lambda environment: WithHistory(environment, history))
+        columns = (*range(n), *range(n + past, n + past + remembered))
+        module = expert.module and OnColumns(expert.module, columns)
+        answer = AnswersOnColumns(expert.answer, columns)
+        size = n + past + remembered
+        asked = replace(expert, answer=answer, module=module, observation_size=size, jacobian=None)
+    else:
+        asked = expert
+    if memory is not None:
 
-    def after(observation: np.ndarray, remembered: np.ndarray) -> np.ndarray:
-        expert.count(1, "remember")
-        return memory.after(observation, remembered)
+        def after(observation: np.ndarray, before: np.ndarray) -> np.ndarray:
+            expert.count(1, "remember")
+            return memory.after(observation[:n], before)
 
-    pool.wrap(lambda environment: Remembering(environment, after, memory.size))
-    return memory.size
+        pool.wrap(lambda environment: Remembering(environment, after, remembered))
+    return asked, past, remembered
 
 
 def visible(
-    student_obs: StudentObservation | None, expert: Expert | None, n: int
+    student_obs: StudentObservation | None, n: int, remembered: int
 ) -> StudentObservation | None:
     """Return what the student sees: never what the expert remembers.
 
     Args:
         student_obs: What the caller says, of the environment's own observations.
-        expert: The expert.
-        n: Length of an observation, with what is remembered.
+        n: Length of an observation, with past and memory.
+        remembered: Length of the memory.
     """
-    if expert is None or expert.memory is None:
+    if not remembered:
         return student_obs
-    own = n - expert.memory.size
+    own = n - remembered
     if student_obs is None:
         return tuple(range(own))
     if callable(student_obs) and not isinstance(student_obs, type):

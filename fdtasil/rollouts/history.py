@@ -1,0 +1,73 @@
+"""The last observations and actions, behind an observation: what a student may be shown."""
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+__all__ = ["Window", "WithHistory", "past_size"]
+
+
+def past_size(history: int, observation_size: int, action_size: int) -> int:
+    """Return how many numbers stand behind an observation: those of the steps before it."""
+    return (history - 1) * (observation_size + action_size)
+
+
+class Window:
+    """The steps before the present one, the latest first; zeros before the start of an episode.
+
+    Args:
+        history: H, how many observations are seen, the present one included.
+        observation_size: n.
+        action_size: m.
+    """
+
+    def __init__(self, history: int, observation_size: int, action_size: int) -> None:
+        self._past = np.zeros((history - 1, observation_size + action_size), np.float64)
+
+    def clear(self) -> None:
+        """Begin an episode."""
+        self._past[:] = 0
+
+    def push(self, observation: np.ndarray, action: np.ndarray) -> None:
+        """Remember a step: what was observed, and what was done."""
+        self._past[1:] = self._past[:-1].copy()
+        self._past[0] = np.concatenate([np.ravel(observation), np.ravel(action)])
+
+    def behind(self, observation: np.ndarray) -> np.ndarray:
+        """Return an observation (n,) with the past behind it."""
+        return np.append(np.asarray(observation, np.float64), self._past)
+
+
+class WithHistory(gymnasium.Wrapper):
+    """An environment whose observations have the last observations and actions behind them.
+
+    Args:
+        env: The environment; its observations and actions are boxes (n,) and (m,).
+        history: H, how many observations are seen.
+    """
+
+    def __init__(self, env: gymnasium.Env, history: int) -> None:
+        super().__init__(env)
+        box, actions = env.observation_space, env.action_space
+        assert isinstance(box, gymnasium.spaces.Box), "the pool has looked at its spaces"
+        assert isinstance(actions, gymnasium.spaces.Box)
+        n, m = box.shape[0], actions.shape[0]
+        wide = np.full(past_size(history, n, m), np.inf)
+        low, high = np.append(box.low, -wide), np.append(box.high, wide)
+        self.observation_space = gymnasium.spaces.Box(low, high, dtype=np.float64)
+        self._window, self._seen = Window(history, n, m), np.zeros(n)
+
+    def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, Any]:
+        """Begin with zeros behind the first observation."""
+        observation, info = self.env.reset(seed=seed, options=options)
+        self._window.clear()
+        self._seen = np.array(observation)
+        return self._window.behind(self._seen), info
+
+    def step(self, action: Any) -> tuple[np.ndarray, Any, bool, bool, Any]:
+        """Remember what was observed and done."""
+        self._window.push(self._seen, np.asarray(action))
+        observation, *rest = self.env.step(action)
+        self._seen = np.array(observation)
+        return self._window.behind(self._seen), *rest  # pyright: ignore[reportReturnType]

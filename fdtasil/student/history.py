@@ -1,0 +1,68 @@
+"""A student that sees the last observations and actions, with a buffer of its own."""
+
+import numpy as np
+
+from fdtasil.checks import check_count
+from fdtasil.errors import SettingError
+from fdtasil.rollouts.history import Window
+from fdtasil.student.policy import Student
+
+__all__ = ["History"]
+
+
+class History:
+    """Asks a student step by step, and keeps what it is to see of the steps before.
+
+    Args:
+        student: Trained with `history=`.
+        history: H, as in that call.
+
+    Raises:
+        SettingError: If the student was trained with another.
+
+    Example:
+        >>> import numpy as np
+        >>> import fdtasil, torch
+        >>> n, m = 2, 1
+        >>> size = n + 2 * (n + m)  # of a history of three
+        >>> student = fdtasil.Student(fdtasil.Mlp(8), np.zeros(size), np.ones(size),
+        ...                           -np.ones(m), np.ones(m), torch.Generator())
+        >>> policy = History(student, 3)
+        >>> policy.observation_size, policy.predict(np.zeros(n), episode_start=True)[0].shape
+        (2, (1,))
+    """
+
+    def __init__(self, student: Student, history: int) -> None:
+        history, m = check_count("history", history), student.action_size
+        # n + (H - 1) (n + m) numbers are seen.
+        self.observation_size, rest = divmod(student.observation_size - (history - 1) * m, history)
+        if rest or self.observation_size < 1:
+            raise SettingError(
+                f"history={history} of a student that sees {student.observation_size} numbers",
+                f"H observations and H - 1 actions of {m}",
+                "pass the history that it was trained with",
+            )
+        self._student = student
+        self._window = Window(history, self.observation_size, m)
+
+    def predict(
+        self,
+        observation: np.ndarray,
+        state: None = None,
+        episode_start: bool = False,
+        deterministic: bool = True,
+    ) -> tuple[np.ndarray, None]:
+        """Answer one observation (n,), and remember it.
+
+        Args:
+            observation: (n,) raw observation.
+            state: Not used; what is remembered is kept here.
+            episode_start: Whether an episode begins, before which there is nothing.
+            deterministic: Not used; the student always is.
+        """
+        if episode_start:
+            self._window.clear()
+        seen = np.asarray(observation, np.float32)
+        action, _ = self._student.predict(self._window.behind(seen))
+        self._window.push(seen, action)
+        return action, None

@@ -1,0 +1,135 @@
+"""A student that sees the last observations and actions."""
+
+import gymnasium
+import numpy as np
+import pytest
+from conftest import GAIN, QUICK, TOY, mlp_onnx
+from test_memory import Remembers
+
+import fdtasil
+from fdtasil.errors import SettingError
+
+pytestmark = pytest.mark.usefixtures("no_pictures")
+
+N, M, H = 5, 2, 3
+PAST = (H - 1) * (N + M)
+RUN = {**QUICK, "history": H, "progress": False}
+
+
+@pytest.fixture(scope="module")
+def file(tmp_path_factory):
+    return mlp_onnx(tmp_path_factory.mktemp("expert") / "e.onnx")
+
+
+def linear_here(rows):
+    assert rows.shape[1] == N
+    return rows @ GAIN.T
+
+
+def test_the_past_stands_behind_each_observation():
+    states = fdtasil.distill(linear_here, TOY, 3, **RUN).dataset.demonstrations
+    assert states.observations.shape[1] == N + PAST
+    for number in range(2):
+        rows = states.observations[states.episode == number]
+        taken = states.taken[states.episode == number]
+        assert (rows[0, N:] == 0).all()
+        for t in range(2, len(rows)):
+            one = np.concatenate([rows[t - 1, :N], taken[t - 1]])
+            two = np.concatenate([rows[t - 2, :N], taken[t - 2]])
+            assert rows[t, N:] == pytest.approx(np.concatenate([one, two]), abs=1e-5)
+    assert states.actions == pytest.approx(states.observations[:, :N] @ GAIN.T, abs=1e-5)
+
+
+@pytest.mark.parametrize("probes", [3, "fresh:3", "jacobian", "basis,central"])
+def test_probes_move_the_present_alone(probes, file):
+    result = fdtasil.distill(file, TOY, probes, **RUN)
+    moved = result.dataset.answers.displacements
+    assert (moved[:, N:] == 0).all()
+    assert (moved[:, :4] != 0).any(axis=0).all()
+
+
+def test_where_it_runs_it_keeps_its_own_past(file, tmp_path):
+    result = fdtasil.distill(file, TOY, 3, **RUN)
+    policy = fdtasil.History(result.student, H)
+    assert policy.observation_size == N
+    environment = gymnasium.make(TOY)
+    rewards = 0.0
+    for seed in fdtasil.seeding.episode_seeds(0, "evaluation", 0, 2):
+        observation, _ = environment.reset(seed=seed)
+        for step in range(20):
+            action, _ = policy.predict(observation, episode_start=step == 0)
+            observation, reward, terminated, *_ = environment.step(action)
+            rewards += reward
+            if terminated:
+                break
+    assert rewards / 2 == pytest.approx(result.evaluation.student_return, rel=1e-3)
+    path = result.to_onnx(tmp_path / "s.onnx")
+    again = fdtasil.evaluate(path, file, TOY, episodes=2, horizon=20, history=H, progress=False)
+    assert again.student_return == pytest.approx(result.evaluation.student_return, rel=1e-3)
+
+
+def test_beside_a_memory_it_is_seen_and_the_memory_is_not(tmp_path):
+    result = fdtasil.distill(Remembers(), TOY, 3, **RUN)
+    states = result.dataset.demonstrations.observations
+    assert states.shape[1] == N + PAST + 6
+    assert result.student.observation_size == N + PAST
+    assert (result.dataset.answers.displacements[:, N:] == 0).all()
+    path = result.to_onnx(tmp_path / "s.onnx")
+    again = fdtasil.evaluate(
+        path, Remembers(), TOY, episodes=2, horizon=20, history=H, progress=False
+    )
+    assert again.student_return == pytest.approx(result.evaluation.student_return, rel=1e-3)
+
+
+class Cart(gymnasium.Env):
+    """A cart that is to stand at 0, pushed by a force; nobody sees its speed."""
+
+    observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (1,), np.float64)
+    action_space = gymnasium.spaces.Box(-3, 3, (1,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.place, self.speed = self.np_random.uniform(-1, 1, 2)
+        return np.array([self.place]), {}
+
+    def step(self, action):
+        self.speed += 0.1 * float(action[0])
+        self.place += 0.1 * self.speed
+        reward = 1 / (1 + 10 * self.place**2 + self.speed**2)
+        return np.array([self.place]), reward, False, False, {}
+
+
+class Differences:
+    """A controller that remembers the last place, for the speed."""
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        begun = state is None
+        before, known = (observation, np.zeros_like(observation)) if begun else state
+        speed = known * (observation - before) / 0.1
+        return np.clip(-2 * observation - 2 * speed, -3, 3), (observation, np.ones_like(known))
+
+
+def test_a_hidden_speed_is_learnt_from_the_past():
+    run = {"episodes": 3, "horizon": 60, "fit": fdtasil.Fit(steps=2000), "progress": False}
+    run |= {"student": fdtasil.Mlp(64), "evaluation_episodes": 10}
+    blind = fdtasil.distill(Differences(), Cart, 5, **run)
+    sees = fdtasil.distill(Differences(), Cart, 5, history=2, **run)
+    assert sees.evaluation.normalized_return > 0.95
+    assert blind.evaluation.normalized_return < 0.7
+
+
+@pytest.mark.parametrize("history", [0, -1, 1.5, "2", None, True], ids=str)
+def test_a_wrong_history_is_named(history):
+    with pytest.raises(SettingError, match="history"):
+        fdtasil.distill(linear_here, TOY, 3, **{**RUN, "history": history})
+
+
+def test_what_a_history_does_not_go_with_is_refused(file):
+    with pytest.raises(SettingError, match="with student_obs"):
+        fdtasil.distill(file, TOY, 3, student_obs=[0], **RUN)
+    result = fdtasil.distill(file, TOY, 0, **RUN)
+    with pytest.raises(SettingError, match="of a student that sees 19 numbers"):
+        fdtasil.History(result.student, 2)
+    dataset = fdtasil.distill(file, TOY, 0, **{**RUN, "history": 1}).dataset
+    with pytest.raises(SettingError, match="without an environment"):
+        fdtasil.distill(file, None, 3, dataset=dataset, history=2, progress=False)
