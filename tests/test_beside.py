@@ -17,7 +17,14 @@ from fdtasil.shell.beside import evaluated_beside
 
 # As the shell has them, where most are left out.
 SHORT = {field.name: None for part in (fdtasil.Fit, fdtasil.Mlp) for field in fields(part)}
-SHORT |= {"output": None, "trust": None, "log_formats": (), "out": None, "resume": None}
+SHORT |= {
+    "output": None,
+    "inputs": None,
+    "trust": None,
+    "log_formats": (),
+    "out": None,
+    "resume": None,
+}
 SHORT |= {"preset": "standard", "steps": 40, "hidden": (16,)}
 SHORT |= {name: QUICK[name] for name in ("episodes", "horizon", "evaluation_episodes")}
 ENDLESS = {"steps": 10**7}
