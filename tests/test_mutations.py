@@ -25,6 +25,7 @@ import pytest
 from mutated_files import mutate
 
 import fdtasil
+from fdtasil.experts.silence import Silence
 
 SECONDS = 90  # without a line, after which a child hangs; its start on a busy machine counts too
 COUNT = 2000
@@ -257,7 +258,7 @@ class Checkpoints(Reader):
         files[name] = change(files[name], random)
         stage = getattr(checkpoints, place.name.partition("-")[0].upper())
         _, account = checkpoints._read_run(files)
-        taken = Account({}, {}, [])
+        taken = Account({}, Silence(), [])
         taken.take_up(account)
         taken.to_json()
         content = stage.read(files)

@@ -325,7 +325,7 @@ def test_violations_of_constraints_are_counted(linear, tmp_path):
         ({"a": 3}, "function of"),
         ({"a": lambda states, actions: states}, r"'a' returned shape \(\d+, 5\)"),
         ({"a": lambda states: states[:, 0]}, "'a' raised TypeError"),
-        ({"a": lambda states, actions: states[:, 0] * np.nan}, "'a' returned shape"),
+        ({"a": lambda states, actions: states[:, 0] * np.nan}, "'a' returned NaN in"),
     ],
     ids=["list", "number", "shape", "raises", "nan"],
 )

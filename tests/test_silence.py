@@ -21,6 +21,7 @@ from fdtasil.rollouts.rollout import rollout
 pytestmark = [
     pytest.mark.usefixtures("no_pictures"),
     pytest.mark.filterwarnings("ignore:the expert had no answer"),
+    pytest.mark.filterwarnings("ignore:.* episodes of the .* were ended, for it had no answer"),
 ]
 
 

@@ -1,6 +1,6 @@
 """Demonstrations: visited states, each with the expert's action."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -82,4 +82,8 @@ def label(episodes: Episodes, expert: Expert, first_episode: int, round_: int) -
     if not none.any():
         return whole
     check_answered(expert.name, expert.silence, int(none.sum()), len(none), "visited states")
-    return Demonstrations(*(part[~none] for part in vars(whole).values()))
+    kept = Demonstrations(*(part[~none] for part in vars(whole).values()))
+    # Where the last state is left out, the one before it is where the episode ended.
+    ended = np.unique(whole.episode[whole.terminated])
+    last = np.append(kept.episode[1:] != kept.episode[:-1], True)
+    return replace(kept, terminated=last & np.isin(kept.episode, ended))

@@ -7,6 +7,7 @@ from functools import partial
 import numpy as np
 
 from fdtasil.errors import ExpertError, warn
+from fdtasil.experts.carrying import carry
 from fdtasil.experts.expert import Expert
 from fdtasil.experts.gate import GATE_STATES, Finding, admit_expert, examine_expert
 from fdtasil.experts.load import ExpertLike, load_expert
@@ -145,7 +146,9 @@ def look_closely(
         expert = load_expert(source, *sizes)
     except ExpertError as error:
         return Looked([Finding("opening", error.found, error)])
-    opening = Finding("opening", f"{expert.name}: {sizes[0]} -> {sizes[1]} numbers", None)
+    expert, _, remembered = carry(expert, pool)
+    boxes, more = pool.boxes, f", remembers {remembered}" if remembered else ""
+    opening = Finding("opening", f"{expert.name}: {sizes[0]} -> {sizes[1]} numbers{more}", None)
     starts = episode_seeds(seed, "evaluation", 0, episodes)
     try:
         own = rollout(follow_answers(expert.policy("act")), pool, starts, length)

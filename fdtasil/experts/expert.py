@@ -84,6 +84,7 @@ class Expert:
         columns: The coordinates that a student's file says it sees, or None.
         jacobian: (B, n) observations -> (B, m, n) derivatives of the actions, where the expert
             may give them itself; or None.
+        takes: The columns of an observation that it is given; None for all of them.
         memory: What it carries along an episode, or None. Its observations are then those of the
             environment with the memory behind them; see `memory.py`.
         module: The same function as a differentiable torch module, or None; only the analytic
@@ -116,6 +117,7 @@ class Expert:
     silence: Silence = field(default_factory=Silence)
     jacobian: Callable[[np.ndarray], np.ndarray] | None = None
     memory: Memory | None = None
+    takes: tuple[int, ...] | None = None
 
     def ask(self, observations: np.ndarray, purpose: Purpose) -> np.ndarray:
         """Answer a batch and count its rows.
@@ -136,12 +138,15 @@ class Expert:
         """
         rows = self._rows(observations)
         self.count(len(rows), purpose)
+        if self.takes is not None:
+            rows = np.ascontiguousarray(rows[:, list(self.takes)])
         starts = range(0, max(len(rows), 1), self.chunk)
         chunks = [rows[start : start + self.chunk] for start in starts]
         if self.workers is not None:
-            answers = np.concatenate(self.workers.each(self._ask_chunk, chunks))
+            parts = self.workers.each(self._ask_chunk, chunks)
         else:
-            answers = np.concatenate([self._ask_chunk(chunk, self.answer) for chunk in chunks])
+            parts = [self._ask_chunk(chunk, self.answer) for chunk in chunks]
+        answers = np.concatenate(_equally_wide(parts))
         none = has_none(answers)
         if none.any():
             answers[none] = np.nan
@@ -196,6 +201,7 @@ class Expert:
         """
         if raised.everywhere:
             raise raised.error
+        self.count(len(rows) if len(rows) > 1 else 0, "check")
         found: list[np.ndarray | None] = [None]
         if len(rows) > 1:
             found = [self._asked_alone(row[None], ask) for row in rows]
@@ -212,7 +218,9 @@ class Expert:
     def _asked_alone(self, row: np.ndarray, ask: Policy) -> np.ndarray | None:
         try:
             return self._checked(row, ask)
-        except _Raised:
+        except _Raised as raised:
+            if raised.everywhere:
+                raise raised.error from raised
             return None
 
     def _check_control(self, ask: Policy, error: ExpertError) -> None:
@@ -241,13 +249,15 @@ class Expert:
             raise
         except Exception as error:
             raise _Raised.of(self.name, len(rows), expected, error) from error
+        if answer.shape == (len(rows), 1) and self.action_size and np.isnan(answer).all():
+            answer = np.repeat(answer, self.action_size, axis=1)  # nulls in the place of rows
         if answer.ndim != 2 or len(answer) != len(rows) or not self._has_action_size(answer):
             raise ExpertError(
                 f"{self.name} answered {rows.shape} observations with shape {answer.shape}",
                 expected,
                 "return one row of actions for each row of observations",
             )
-        infinite = np.isinf(answer).any(axis=1)
+        infinite = np.asarray(np.isinf(answer).any(axis=1))
         if infinite.any():
             raise _not_finite(self, len(rows), infinite)
         return answer
@@ -284,6 +294,17 @@ class _Raised(Exception):
 
 
 _NOT_OF_A_ROW = {"MemoryError", "TimeoutError", "RecursionError"}
+
+
+def _equally_wide(parts: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """Return answers of one width: where all rows of a batch had none, it was not known."""
+    width = max(part.shape[1] for part in parts)
+    return [
+        np.repeat(part, width, axis=1)
+        if part.shape[1] == 1 < width and np.isnan(part).all()
+        else part
+        for part in parts
+    ]
 
 
 def _not_finite(expert: Expert, rows: int, bad: np.ndarray) -> ExpertError:

@@ -25,6 +25,7 @@ from fdtasil.experts.own_jacobian import own_jacobian
 from fdtasil.experts.predicting import open_predictor
 from fdtasil.experts.sb3.agent import read_agent
 from fdtasil.experts.sb3.trust import Trust
+from fdtasil.experts.silence import Silence
 from fdtasil.experts.sizes import size_hint
 from fdtasil.experts.trial import vouch_for
 from fdtasil.experts.workers import BATCH, Workers, check_workers, with_processes, with_threads
@@ -116,6 +117,12 @@ def load_expert(
     bound = None if inputs is None else check_inputs(inputs)
     hints = Hints(observation_size, action_size, output, trust, timeout, bound, memory)
     kind = _kind_of(source)
+    if (bound or memory) and not isinstance(source, str | Path):
+        raise SettingError(
+            f"{'inputs' if bound else 'memory'}= of a {type(source).__name__}",
+            "the path of an ONNX file, whose inputs have names",
+            "leave it out",
+        )
     workers, timeout = check_workers(workers, threads, timeout, kind.remote)
     expert = sized(open_expert(source, hints), observation_size, action_size)
     if batch is None and workers and expert.chunk == CHUNK:
@@ -202,7 +209,7 @@ def _open_again(file: str | Path, hints: Hints, sha256: str | None) -> Policy:
 
 
 def _from_expert(expert: Expert, hints: Hints) -> Expert:
-    return dataclasses.replace(expert, queries=Counter())
+    return dataclasses.replace(expert, queries=Counter(), silence=Silence())
 
 
 def _from_http(url: str, hints: Hints) -> Expert:

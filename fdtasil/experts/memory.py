@@ -13,7 +13,7 @@ import torch
 
 from fdtasil.rollouts.behaviours import Policy
 
-__all__ = ["AnswersOnColumns", "Memory", "OnColumns", "Step", "stateless"]
+__all__ = ["Memory", "OnColumns", "Step", "stateless"]
 
 Step = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 """(B, n) observations and (B, k) memories -> (B, m) actions, and the memories after them."""
@@ -67,15 +67,3 @@ class OnColumns(torch.nn.Module):
     def forward(self, rows: torch.Tensor) -> torch.Tensor:
         """(B, n) -> (B, m)."""
         return self.module(rows[:, self.columns])
-
-
-@dataclass(frozen=True)
-class AnswersOnColumns:
-    """A policy that is given some columns of an observation."""
-
-    answer: Policy
-    columns: tuple[int, ...]
-
-    def __call__(self, rows: np.ndarray) -> np.ndarray:
-        """(B, n) -> (B, m)."""
-        return self.answer(np.ascontiguousarray(rows[:, list(self.columns)]))

@@ -2,7 +2,7 @@
 
 import inspect
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
@@ -90,8 +90,26 @@ def _carried(
     step = _Carries(asked, statistics, options, tuple(axis or 0 for axis in axes))
     first = _flat(_leaves(states[0]), step.axes)
     memory = Memory(first.shape[1], step)
+    _check_start(asked, step, memory.size, observation_size, name)
     n = observation_size
     return Expert(stateless(step, n), name, n + memory.size, memory=memory)
+
+
+def _check_start(source: Any, step: "_Carries", k: int, n: int, name: str) -> None:
+    """Refuse a memory that does not begin with zeros.
+
+    Raises:
+        ExpertError: If the first answer of an episode is not that to a memory of zeros.
+    """
+    rows = np.random.default_rng(0).standard_normal((2, n)).astype(np.float32)
+    begun = source.predict(rows.copy(), episode_start=np.ones(2, bool), **step.options)[0]
+    zeros, _ = replace(step, statistics=None)(rows.copy(), np.zeros((2, k), np.float32))
+    if not np.allclose(begun, zeros, rtol=1e-3, atol=1e-4):
+        raise ExpertError(
+            f"{name} begins an episode with another memory than zeros",
+            "a memory of zeros at the start",
+            "wrap it: let its state be the difference to the first one",
+        )
 
 
 def _ask_first(source: Any, rows: int, n: int, options: Mapping[str, bool]) -> Any:

@@ -62,7 +62,8 @@ def shared_function(source: str, name: str) -> Callable[[int, int], None]:
         file.write_text(source)
         command = [found, "-std=c99", "-O2", "-shared", "-fPIC", "-o", str(library), str(file)]
         _run([*command, "-lm"], "", f"{found} can't compile the C file")
-        function = getattr(ctypes.CDLL(str(library)), name)
+        # With the interpreter's lock held: the buffers of such a function are static.
+        function = getattr(ctypes.PyDLL(str(library)), name)
     function.argtypes, function.restype = [ctypes.c_void_p, ctypes.c_void_p], None
     return function
 

@@ -86,7 +86,7 @@ def ask_probes(
 ) -> Answers:
     """Ask the expert around each state; probes without an answer are left out.
 
-    A state has others of its probes twice then, and one without any answer is asked about itself.
+    A state has others of its probes twice then, and one without any answer has its own label.
 
     Args:
         expert: Who is asked; differentiated instead, if the stencil is exact.
@@ -115,7 +115,7 @@ def ask_probes(
             offsets = probes.stencil.offsets
             values = _ask_values(expert, observations, drawn, offsets, beginning)
         answers = Answers(drawn.displacements, drawn.numbers, values, drawn.gains)
-        return _without_silence(answers, expert, observations)
+        return _without_silence(answers, expert, around)
     except MemoryError as error:
         numbers = str(error).startswith(_NEEDED) and f": {error}"
         raise SettingError(
@@ -126,7 +126,7 @@ def ask_probes(
         ) from error
 
 
-def _without_silence(answers: Answers, expert: Expert, observations: np.ndarray) -> Answers:
+def _without_silence(answers: Answers, expert: Expert, around: Surroundings) -> Answers:
     """Replace probes without an answer by others of their state."""
     silent = np.asarray(np.isnan(answers.values).any(axis=3))
     if not silent.any():
@@ -142,19 +142,25 @@ def _without_silence(answers: Answers, expert: Expert, observations: np.ndarray)
         values[found] = np.roll(answers.values, -turn, axis=1)[found]
         left &= ~found
     whole = Answers(answers.displacements, numbers, values, answers.gains)
-    return _asked_about_themselves(whole, np.asarray(left.all(axis=1)), expert, observations)
+    return _standing_still(whole, np.asarray(left.all(axis=1)), expert, around)
 
 
-def _asked_about_themselves(
-    answers: Answers, states: np.ndarray, expert: Expert, observations: np.ndarray
+def _standing_still(
+    answers: Answers, states: np.ndarray, expert: Expert, around: Surroundings
 ) -> Answers:
     """Let some states, (N,) bool, have probes that move nothing, which teach nothing new."""
     if not states.any():
         return answers
-    said = expert.ask(observations[states], "probe")
-    none = int(has_none(said).sum())
-    if none:  # it had an answer when the state was labelled
-        check_answered(expert.name, expert.silence, len(said), none, "states asked about again")
+    if around.actions is not None:
+        said = around.actions[states]
+    else:
+        said = expert.ask(around.observations[states], "probe")
+        if has_none(said).any():
+            raise ExpertError(
+                f"{expert.name} has no answer at a state, and none around it",
+                "one of them",
+                "leave such states out",
+            )
     numbers, values = answers.numbers.copy(), answers.values.copy()
     numbers[states], values[states] = len(answers.displacements), said[:, None, None, :]
     still = np.zeros((1, answers.displacements.shape[1]), np.float32)

@@ -194,6 +194,7 @@ def calibrate(
     floor = float(np.sqrt((second**2).mean() / 6))
     change = np.sqrt(((values - centres[:, None, None, :]) ** 2).mean(axis=(0, 2, 3)))
     regime, radius, stencil = _judge(similarity, radii[1:], usual)
+    radius = min(radius, float(radii[-1]))  # where it still answers
     steep = np.interp(np.log(radius), np.log(radii), change) > _STEEP * centres.std(axis=0).mean()
     return Calibration(
         regime,

@@ -68,7 +68,7 @@ def gains(
 
     Args:
         expert: As in `load_expert`.
-        states: (N, n) observations.
+        states: (N, n) observations; of an opened expert with a memory, with that behind them.
         scale: (n,) by how much each coordinate usually differs; measured over the states if left
             out, and 1 where they are a single one or do not differ.
         seed: Of the ladder's states and coordinates.
@@ -88,7 +88,9 @@ def gains(
     """
     rows = _checked(states)
     units = _units(rows, scale)
-    asked = load_expert(expert, rows.shape[1])
+    # One with a memory is asked about observations with the memory behind them.
+    known = isinstance(expert, Expert) and expert.memory is not None
+    asked = load_expert(expert) if known else load_expert(expert, rows.shape[1])
     random = np.random.default_rng(check_count("seed", seed, 0))
     noise, curvature = _law(asked, rows, units, random)
     radius = _best_radius(noise, curvature)

@@ -48,6 +48,7 @@ class Surroundings:
         step: Length of a direction's step in deviations, over all coordinates.
         ends: The nearest and the farthest that it is stretched to.
         draw: Draws directions in these coordinates.
+        actions: (N, m) float32 what the expert said at the states; None where that is not known.
     """
 
     observations: np.ndarray
@@ -58,6 +59,7 @@ class Surroundings:
     step: float
     ends: tuple[float, float]
     draw: Draw
+    actions: np.ndarray | None = None
 
     @classmethod
     def of(

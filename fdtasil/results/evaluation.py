@@ -49,7 +49,8 @@ class Evaluation:
             where the expert is no better than the reference, and the share means nothing.
         ci95: 95 % bootstrap interval of the normalised return, over paired episodes; None with it,
             or for a single pair.
-        survival: Share of the student's episodes that the environment did not end.
+        survival: Share of the student's episodes that neither the environment ended, nor a policy
+            without an answer.
         expert_survival: The same for the expert.
         action_error: Mean Euclidean distance of the student's action to the expert's, on the
             student's own states, in action units.
@@ -119,6 +120,7 @@ def evaluate_pair(
     seed: int,
     progress: Progress,
     constraints: Constraints | None = None,
+    own: int | None = None,
 ) -> Evaluation:
     """Run a policy from the starts of the expert's episodes, and compare.
 
@@ -131,7 +133,13 @@ def evaluate_pair(
         seed: Of the bootstrap, and of the random actions where they are the reference.
         progress: Progress bars.
         constraints: What is counted where it is violated.
+        own: Length of the environment's own observations, which constraints are functions of; the
+            whole of them if left out.
     """
+    broken = {
+        name: _violated(name, constraint, expert_episodes, pool, own)  # before hours of steps
+        for name, constraint in (constraints or {}).items()
+    }
     seeds = [int(s) for s in expert_episodes.seeds]
     with progress.bar("evaluation", "step", len(seeds) * horizon) as bar:
         student_episodes = rollout(student, pool, seeds, horizon, on_step=bar.move)
@@ -144,12 +152,18 @@ def evaluate_pair(
             f"the expert's return {theirs.mean():.4g} is not above {least}: no normalised return; "
             "check that expert and environment belong together"
         )
+    for who, episodes in (("expert", expert_episodes), ("policy", student_episodes)):
+        if episodes.given_up.any():
+            warn(
+                f"{episodes.given_up.sum()} of {len(seeds)} episodes of the {who} were ended, "
+                "for it had no answer for long; their returns are of shorter episodes"
+            )
     reset = student_episodes.physics_resets > 0
     if reset.mean() > 0.5:  # more than one start each: not the returns of this policy
         meaningful = False
     visited = student_episodes.observations[student_episodes.valid]
-    own = student_episodes.actions[student_episodes.valid]
-    distance = np.linalg.norm(own - expert.ask(visited, "evaluate"), axis=1)
+    acted = student_episodes.actions[student_episodes.valid]
+    distance = np.linalg.norm(acted - expert.ask(visited, "evaluate"), axis=1)
     distance = distance[~np.isnan(distance)]  # where the expert has an answer
     return Evaluation(
         episodes=len(seeds),
@@ -159,8 +173,8 @@ def evaluate_pair(
         reference_return=reference,
         normalized_return=_share(ours - reference, theirs - reference) if meaningful else None,
         ci95=_interval(ours - reference, theirs - reference, seed) if meaningful else None,
-        survival=float(1 - student_episodes.terminated.mean()),
-        expert_survival=float(1 - expert_episodes.terminated.mean()),
+        survival=_survival(student_episodes),
+        expert_survival=_survival(expert_episodes),
         action_error=float(distance.mean()) if len(distance) else float("nan"),
         imitation_gap=_imitation_gap(student_episodes, expert_episodes),
         expert_returns=tuple(theirs.tolist()),
@@ -168,14 +182,15 @@ def evaluate_pair(
         expert_physics_resets=int((expert_episodes.physics_resets > 0).sum()),
         physics_resets=int(reset.sum()),
         violations=tuple(
-            (
-                name,
-                _violated(name, constraint, expert_episodes, pool),
-                _violated(name, constraint, student_episodes, pool),
-            )
+            (name, broken[name], _violated(name, constraint, student_episodes, pool, own))
             for name, constraint in (constraints or {}).items()
         ),
     )
+
+
+def _survival(episodes: Episodes) -> float:
+    """Return the share of the episodes that nothing ended before their time."""
+    return float(1 - (episodes.terminated | episodes.given_up).mean())
 
 
 def check_constraints(constraints: object) -> Constraints:
@@ -201,9 +216,10 @@ def _violated(
     constraint: Callable[[np.ndarray, np.ndarray], np.ndarray],
     episodes: Episodes,
     pool: EnvironmentPool,
+    own: int | None,
 ) -> float:
     """Return the share of the steps at which a constraint is violated."""
-    states = episodes.observations[episodes.valid]
+    states = episodes.observations[episodes.valid][:, :own]
     actions, _ = pool.bounds.put_inside(episodes.actions[episodes.valid])
     try:
         found = np.asarray(constraint(states.copy(), actions.copy()), np.float64)
@@ -211,7 +227,8 @@ def _violated(
         said = f"constraints: {name!r} raised {type(error).__name__}: {first_line(error)}"
         raise SettingError(said, _CONSTRAINTS, _LIMIT) from error
     if found.shape != (len(states),) or np.isnan(found).any():
-        said = f"constraints: {name!r} returned shape {found.shape}"
+        nan = "NaN in " if np.isnan(found).any() else ""
+        said = f"constraints: {name!r} returned {nan}shape {found.shape}"
         raise SettingError(said, f"({len(states)},) numbers, positive where violated", _LIMIT)
     return float((found > 0).mean())
 

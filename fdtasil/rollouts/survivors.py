@@ -32,7 +32,7 @@ def survivors(
     """
     recorded = 0
     for _ in range(ATTEMPTS):
-        fallen = np.flatnonzero(episodes.terminated)
+        fallen = np.flatnonzero(episodes.terminated | episodes.given_up)
         if len(fallen):
             episodes = _replaced(episodes, fallen, record(recorded, len(fallen)))
             recorded += len(fallen)

@@ -7,6 +7,7 @@ from contextlib import contextmanager
 from typing import Any
 
 from fdtasil.errors import SettingError
+from fdtasil.experts.silence import Silence
 
 __all__ = ["Account", "check_account"]
 
@@ -58,14 +59,13 @@ class Account:
 
     Args:
         ledger: Rows that the expert was asked for in this process, by purpose.
-        silence: Those of them that had no answer.
+        silence: What is known of those that had no answer.
         notes: The library's warnings in this process; grows by itself.
     """
 
-    def __init__(
-        self, ledger: Mapping[str, int], silence: Mapping[str, int], notes: Sequence[str]
-    ) -> None:
-        self._asked, self._silent, self._notes = _Tally(ledger), _Tally(silence), notes
+    def __init__(self, ledger: Mapping[str, int], silence: Silence, notes: Sequence[str]) -> None:
+        self._asked, self._silent, self._notes = _Tally(ledger), _Tally(silence.rows), notes
+        self._silence = silence
         self._earlier: dict[str, Any] = {"again": 0, "notes": [], "seconds": 0.0}
         self._heard = 0  # notes of this process, when the earlier ones were taken up
         self._began = time.perf_counter()
@@ -106,6 +106,7 @@ class Account:
         return {
             "queries": self._asked.to_json(),
             "silent": self._silent.to_json(),
+            "reason": self._silence.reason,
             "again": self.again,
             "notes": self.notes,
             "seconds": self.seconds,
@@ -116,6 +117,8 @@ class Account:
         self._earlier = earlier
         self._asked.take_up(earlier["queries"])
         self._silent.take_up(earlier.get("silent", {}))  # older versions knew of none
+        if earlier.get("silent"):
+            self._silence.reason = earlier["reason"]
         self._heard = len(self._notes)
         self.start_clock()
 
@@ -154,6 +157,7 @@ def check_account(earlier: object) -> None:
     good = (
         isinstance(queries, dict)
         and isinstance(silent, dict)
+        and isinstance(earlier.get("reason", ""), str)
         and all(
             type(rows) is int for rows in (*queries.values(), *silent.values(), earlier["again"])
         )

@@ -1,8 +1,11 @@
 """Asking the probes of a run: how far is found first, the budget holds, nothing is asked twice."""
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 
+from fdtasil.demonstrations.states import Demonstrations
 from fdtasil.errors import SettingError
 from fdtasil.experts.expert import Expert
 from fdtasil.probes.answers import FROM_THE_START, Answers, Beginning, ask_probes
@@ -49,16 +52,17 @@ class Asking:
             self.calibration, self.source = found, found.complete(self._run.probes)
 
     def around(
-        self, observations: np.ndarray, scales: Scales, *, again: bool = False
+        self, states: Demonstrations, scales: Scales, *, again: bool = False
     ) -> Surroundings:
-        """Return where the source probes around (N, n) states; see `Surroundings.of`.
+        """Return where the source probes around labelled states; see `Surroundings.of`.
 
         Raises:
             SettingError: If there is nobody to ask, or as `Surroundings.of`.
         """
         assert self.source is not None, "plain behaviour cloning asks no probes"
         self._askable()
-        return Surroundings.of(observations, self.source, scales, again=again)
+        found = Surroundings.of(states.observations, self.source, scales, again=again)
+        return replace(found, actions=states.actions)
 
     def twin(self, around: Surroundings, said: Answers, device: torch.device) -> DeviceTwin | None:
         """Return who answers on a GPU in the expert's place; see `DeviceTwin.of`."""

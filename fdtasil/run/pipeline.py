@@ -11,10 +11,12 @@ from fdtasil.compute import pick_device, torch_settings
 from fdtasil.demonstrations.dataset import Dataset, DatasetLike, load_dataset
 from fdtasil.demonstrations.trainers import Trainer
 from fdtasil.errors import SettingError, heard_warnings
+from fdtasil.experts.carrying import carry
 from fdtasil.experts.examination import check_first, examine
 from fdtasil.experts.expert import Expert, Hints
 from fdtasil.experts.gate import GATE_STATES, compare_again, large_batch
 from fdtasil.experts.load import ExpertLike, load_expert, open_expert, sized
+from fdtasil.experts.silence import Silence
 from fdtasil.probes.source import Probes
 from fdtasil.probes.spread import SpreadLike
 from fdtasil.progress import Progress
@@ -37,7 +39,7 @@ from fdtasil.run.interrupts import heard_interrupts
 from fdtasil.run.lesson import Lesson
 from fdtasil.run.report import config_of, no_answer, report_of
 from fdtasil.run.rounds import Rounds
-from fdtasil.run.subject import Subject, carry, open_subject, visible
+from fdtasil.run.subject import Subject, open_subject, visible
 from fdtasil.run.training import Training
 from fdtasil.seeding import episode_seeds
 from fdtasil.student.architectures import Architecture
@@ -199,8 +201,8 @@ def distill(
             if folder and kept.finished and resume is not None:
                 return Distilled.load(folder, student_obs)
             expert = subject.expert
-            asked, silent = (expert.queries, expert.silence.rows) if expert else ({}, {})
-            account = Account(asked, silent, notes)
+            asked, silence = (expert.queries, expert.silence) if expert else ({}, Silence())
+            account = Account(asked, silence, notes)
             checkpoints = Checkpoints(kept, account, Asking(run, subject.expert, account))
             training = Training(run, chosen, checkpoints, bars, interrupts, told)
             rounds = Rounds(run, student_obs, _collecting(run, subject, bars), training)
@@ -263,8 +265,8 @@ def evaluate(
     with EnvironmentPool(env) as pool, torch_settings(torch.device("cpu")):
         n, m = pool.boxes.observation_size, pool.boxes.action_size
         black_box, length = load_expert(expert, n, m), resolve_horizon(horizon, pool)
-        own = n + past_size(history, n, m)
-        judged = open_expert(policy, Hints(view_size(student_obs, own), m))
+        seen_size = view_size(student_obs, n + past_size(history, n, m))
+        judged = open_expert(policy, Hints(seen_size, m))
         if judged.memory is not None:
             raise SettingError(
                 f"{judged.name}, which has a memory, to be judged",
@@ -281,7 +283,8 @@ def evaluate(
         view = View.of(seen, theirs.observations[theirs.valid][:256])
         answer = view.policy(sized(judged, view.size, m).policy("evaluate"))
         acting = follow_answers(answer)
-        return evaluate_pair(acting, black_box, theirs, pool, length, seed, bars, limits)
+        own = n - past - remembered
+        return evaluate_pair(acting, black_box, theirs, pool, length, seed, bars, limits, own)
 
 
 def check_history(history: object, student_obs: object) -> int:
@@ -343,6 +346,7 @@ def _complete(
                 run.seed,
                 rounds.training.progress,
                 constraints,
+                run.observation_size - run.past - run.remembered,
             )
             about = int(last["round"]), trained.steps, last
             rounds.training.callback(Event("evaluation", *about, student, evaluation))

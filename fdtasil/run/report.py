@@ -31,7 +31,8 @@ def config_of(run: Configuration) -> dict[str, Any]:
 def no_answer(account: Account) -> dict[str, float]:
     """Return the share of the rows asked that had no answer, by purpose, where some had none."""
     asked = account.queries
-    return {name: rows / asked[name] for name, rows in account.silent.items() if rows > 0}
+    silent = account.silent.items()
+    return {name: rows / asked[name] for name, rows in silent if rows > 0 and asked[name] > 0}
 
 
 def report_of(

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fdtasil.demonstrations.dataset import Dataset
+from fdtasil.demonstrations.states import Demonstrations
 from fdtasil.probes.answers import Answers, Beginning
 from fdtasil.rollouts.behaviours import Policy
 from fdtasil.rollouts.episodes import Episodes
@@ -163,19 +164,19 @@ class Rounds:
         around = Lesson.of(whole, self.student_obs, lesson, self.run.spread, self.run.held)
         if self.run.probes is None:
             return around
-        answers = self._answers(round_, states.observations, around)
+        answers = self._answers(round_, states, around)
         answers = answers if old is None else old + answers
         source = self.checkpoints.asking.source
         dataset = replace(whole.dataset, probes=source, answers=answers)
         return replace(around, collected=replace(whole, dataset=dataset))
 
-    def _answers(self, round_: int, observations: np.ndarray, lesson: Lesson) -> Answers:
+    def _answers(self, round_: int, states: Demonstrations, lesson: Lesson) -> Answers:
         """Ask the probes around a round's states; the answers are kept on the way."""
         known = self.checkpoints.take_up(round_, ASKED)
         asking = self.checkpoints.asking
         asking.calibrate(lesson.dataset.demonstrations.observations, lesson.scales)
-        around = asking.around(observations, lesson.scales)
-        with self.training.progress.bar("probes", "state", len(observations)) as bar:
+        around = asking.around(states, lesson.scales)
+        with self.training.progress.bar("probes", "state", len(states)) as bar:
 
             def told(values: np.ndarray, states: int) -> None:
                 bar.move(states)

@@ -40,7 +40,9 @@ class Samples:
     @cached_property
     def around(self) -> Surroundings:
         """Where the source probes; the same for all samples."""
-        return self.asking.around(self.observations, self.lesson.scales, again=True)
+        return self.asking.around(
+            self.lesson.dataset.demonstrations, self.lesson.scales, again=True
+        )
 
     @cached_property
     def twin(self) -> DeviceTwin | None:

@@ -2,21 +2,17 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass, replace
-
-import numpy as np
+from dataclasses import dataclass
 
 from fdtasil.demonstrations.dataset import Dataset
 from fdtasil.errors import SettingError
+from fdtasil.experts.carrying import carry
 from fdtasil.experts.expert import Expert
 from fdtasil.experts.load import ExpertLike, load_expert
-from fdtasil.experts.memory import AnswersOnColumns, OnColumns
 from fdtasil.rollouts.environments import EnvironmentLike, EnvironmentPool
-from fdtasil.rollouts.history import WithHistory, past_size
-from fdtasil.rollouts.remembering import Remembering
 from fdtasil.student.view import StudentObservation, describe_view
 
-__all__ = ["Subject", "carry", "open_subject", "visible"]
+__all__ = ["Subject", "open_subject", "visible"]
 
 
 @dataclass(frozen=True)
@@ -88,52 +84,6 @@ def open_subject(
         if expert is not None:
             opened, past, remembered = carry(load_expert(expert, n, m), pool, history)
         yield Subject(opened, pool, name, n + past + remembered, m, past, remembered)
-
-
-def carry(
-    expert: Expert, pool: EnvironmentPool | None, history: int = 1
-) -> tuple[Expert, int, int]:
-    """Let an environment show what an expert would remember, and what a student is to see.
-
-    Args:
-        expert: The expert.
-        pool: The environment, whose observations become longer: its own, those of the past with
-            the actions then, and the expert's memory.
-        history: How many observations the student sees.
-
-    Returns:
-        The expert, which takes its part of them, and the lengths of past and memory.
-
-    Raises:
-        SettingError: If there is no environment, and so nothing to remember.
-    """
-    memory = expert.memory
-    if memory is None and history == 1:
-        return expert, 0, 0
-    if pool is None:
-        what = f"history={history}" if memory is None else f"{expert.name}, which has a memory,"
-        raise SettingError(
-            f"{what} without an environment", "one in which it is remembered", "pass env="
-        )
-    n, m = pool.boxes.observation_size, pool.boxes.action_size
-    past, remembered = past_size(history, n, m), memory.size if memory else 0
-    if past:
-        pool.wrap(lambda environment: WithHistory(environment, history))
-        columns = (*range(n), *range(n + past, n + past + remembered))
-        module = expert.module and OnColumns(expert.module, columns)
-        answer = AnswersOnColumns(expert.answer, columns)
-        size = n + past + remembered
-        asked = replace(expert, answer=answer, module=module, observation_size=size, jacobian=None)
-    else:
-        asked = expert
-    if memory is not None:
-
-        def after(observation: np.ndarray, before: np.ndarray) -> np.ndarray:
-            expert.count(1, "remember")
-            return memory.after(observation[:n], before)
-
-        pool.wrap(lambda environment: Remembering(environment, after, remembered))
-    return asked, past, remembered
 
 
 def visible(

@@ -8,7 +8,6 @@ import numpy as np
 
 from fdtasil.checks import check_count
 from fdtasil.experts.examination import look_closely
-from fdtasil.experts.load import load_expert
 from fdtasil.files.storage import write_bytes
 from fdtasil.probes.gains import Gains, gains
 from fdtasil.probes.scales import measure_scales
@@ -58,12 +57,13 @@ def command(
         if looked.own is None:
             assert problem is not None, "an expert that can't act has a finding that says why"
             raise problem
-        sizes = pool.boxes.observation_size, pool.boxes.action_size
+        asked = looked.expert
+        assert asked is not None, "who acted was opened"
         visited = looked.own.observations[looked.own.valid]
         scales = measure_scales(visited)
         scale = np.where(scales.live, scales.deviation, 1.0)
         chosen = looked.own.spread(states)
-        found = gains(load_expert(source, *sizes), chosen, scale=scale, seed=seed)
+        found = gains(asked, chosen, scale=scale, seed=seed)
     print(_summary(found))
     if file is not None:
         write_bytes(file, _packed(chosen, found))

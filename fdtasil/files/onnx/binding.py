@@ -133,19 +133,44 @@ def _complete(
     for name in left:
         dimensions = entries[name].type.tensor_type.shape.dim
         width = dimensions[-1].dim_value if dimensions else 0
-        start = 0 if not taken or taken[0][0] > 0 else taken[-1][1]
-        stop = start + width if width else size
-        if stop is None or stop <= start:
+        # The other columns: those before what is taken, or those behind it.
+        before = bool(taken) and taken[0][0] > 0
+        start = 0 if not taken or before else taken[-1][1]
+        end = taken[0][0] if before else size
+        stop = start + width if width else end
+        if stop is None or stop <= start or (end is not None and stop > end):
             example = f'write inputs={{"{name}": "{start}:..."}}'
             raise SettingError(
-                f"inputs: {_described(entries[name])} is open", "its columns", example
+                f"inputs: {_described(entries[name])} is left out, and has no columns of its own",
+                "the columns that no other input has",
+                example,
             )
         parts[name] = slice(start, stop)
+    for name, part in parts.items():
+        if isinstance(part, slice) and size is not None and part.stop > size:
+            found = f"inputs: {name!r} is given columns up to {part.stop}"
+            raise SettingError(found, f"columns of {size}", _EXAMPLE)
+        _check_width(entries[name], part, listed)
     if not any(isinstance(part, slice) for part in parts.values()):
         raise SettingError(
             "inputs: all of them are constants", "one with the observation", _EXAMPLE
         )
     return parts
+
+
+def _check_width(entry: "onnx.ValueInfoProto", part: "slice | np.ndarray", listed: str) -> None:
+    """Refuse columns, or a constant, that an input has no place for."""
+    dimensions = entry.type.tensor_type.shape.dim
+    width = dimensions[-1].dim_value if len(dimensions) == 2 else 0
+    if not width:
+        return
+    given = part.stop - part.start if isinstance(part, slice) else part.size
+    if given != width and not (isinstance(part, np.ndarray) and given == 1):
+        raise SettingError(
+            f"inputs: {entry.name!r} is given {given} numbers, of {listed}",
+            f"{width} of them",
+            _EXAMPLE,
+        )
 
 
 class _Feed:

@@ -41,15 +41,22 @@ def find_memory(
     inputs = {entry.name: entry for entry in model.graph.input if entry.name not in constants}
     outputs = {entry.name: entry for entry in model.graph.output}
     if given is not None:
+        if not isinstance(given, Mapping) or not given:
+            raise SettingError(f"memory={shown(given)[:80]}", "inputs and their outputs", _EXAMPLE)
         for name, there in (
             *((n, inputs) for n in given),
             *((n, outputs) for n in given.values()),
         ):
             if name not in there:
                 listed = ", ".join(map(shown, there))
-                raise SettingError(
-                    f"memory: {name!r}", f"one of {listed}", 'write memory={"h_in": "h_out"}'
-                )
+                raise SettingError(f"memory: {name!r}", f"one of {listed}", _EXAMPLE)
+        left = [name for name in inputs if name not in given and name not in bound]
+        if len(left) != 1:
+            raise SettingError(
+                f"memory: {len(left)} inputs are left beside it: {', '.join(map(shown, left))}",
+                "one, the observation",
+                "name every input of the memory, each with its output",
+            )
         return tuple(given.items())
     pairs, free = [], list(outputs)
     for place, (name, entry) in enumerate(inputs.items()):
@@ -57,7 +64,7 @@ def find_memory(
         likely = MEMORY_NAMES.search(name) or (place > 0 and len(sizes) == 3)
         same = [o for o in free if _sizes(outputs[o])[-1:] == sizes[-1:] and sizes[-1:]]
         same = [o for o in same if len(_sizes(outputs[o])) == len(sizes)]
-        same.sort(key=lambda o: not MEMORY_NAMES.search(o))
+        same.sort(key=lambda o: (_stem(o) != _stem(name), not MEMORY_NAMES.search(o)))
         if likely and same and name not in bound:
             pairs.append((name, same[0]))
             free.remove(same[0])
@@ -65,8 +72,16 @@ def find_memory(
     return tuple(pairs) if len(left) == 1 and free else ()
 
 
+def _stem(name: str) -> str:
+    """Return what is left of a name without the words for in and out."""
+    return re.sub(r"(?i)(in|out|prev|next|new|old|[0-9n]|_|\.)+$", "", name).lower()
+
+
 def _sizes(entry: "onnx.ValueInfoProto") -> list[int]:
     return [dimension.dim_value for dimension in entry.type.tensor_type.shape.dim]
+
+
+_EXAMPLE = 'write memory={"h_in": "h_out"}'
 
 
 class RecurrentPolicy:

@@ -1,0 +1,59 @@
+"""What an expert remembers, and what a student is shown of the past, in an environment."""
+
+from dataclasses import replace
+
+import numpy as np
+
+from fdtasil.errors import SettingError
+from fdtasil.experts.expert import Expert
+from fdtasil.experts.memory import OnColumns
+from fdtasil.rollouts.environments import EnvironmentPool
+from fdtasil.rollouts.history import WithHistory, past_size
+from fdtasil.rollouts.remembering import Remembering
+
+__all__ = ["carry"]
+
+
+def carry(
+    expert: Expert, pool: EnvironmentPool | None, history: int = 1
+) -> tuple[Expert, int, int]:
+    """Let an environment show what an expert would remember, and what a student is to see.
+
+    Args:
+        expert: The expert.
+        pool: The environment, whose observations become longer: its own, those of the past with
+            the actions then, and the expert's memory.
+        history: How many observations the student sees.
+
+    Returns:
+        The expert, which takes its part of them, and the lengths of past and memory.
+
+    Raises:
+        SettingError: If there is no environment, and so nothing to remember.
+    """
+    memory = expert.memory
+    if memory is None and history == 1:
+        return expert, 0, 0
+    if pool is None:
+        what = f"history={history}" if memory is None else f"{expert.name}, which has a memory,"
+        raise SettingError(
+            f"{what} without an environment", "one in which it is remembered", "pass env="
+        )
+    n, m = pool.boxes.observation_size, pool.boxes.action_size
+    past, remembered = past_size(history, n, m), memory.size if memory else 0
+    if past:
+        pool.wrap(lambda environment: WithHistory(environment, history))
+        columns = (*range(n), *range(n + past, n + past + remembered))
+        module = expert.module and OnColumns(expert.module, columns)
+        size = n + past + remembered
+        asked = replace(expert, takes=columns, module=module, observation_size=size, jacobian=None)
+    else:
+        asked = expert
+    if memory is not None:
+
+        def after(observation: np.ndarray, before: np.ndarray) -> np.ndarray:
+            expert.count(1, "remember")
+            return memory.after(observation[:n], before)
+
+        pool.wrap(lambda environment: Remembering(environment, after, remembered))
+    return asked, past, remembered
