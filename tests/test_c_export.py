@@ -173,3 +173,12 @@ def test_a_c_file_of_others_is_refused(tmp_path):
         fdtasil.load_expert(tmp_path / "other.c", trust="c")
     with pytest.raises(ExpertError, match="your permission"):
         fdtasil.load_expert(tmp_path / "other.c")
+
+
+@needs_a_compiler
+def test_threads_do_not_mix_the_buffers_of_compiled_code(quick, tmp_path):
+    path = quick.export(tmp_path / "student.c")
+    rows = np.random.default_rng(0).standard_normal((4096, 5)).astype(np.float32)
+    threads = fdtasil.load_expert(path, trust="c", workers=4, threads=True, batch=256)
+    alone = fdtasil.load_expert(path, trust="c")
+    assert np.array_equal(threads.ask(rows, "act"), alone.ask(rows, "act"))

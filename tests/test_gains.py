@@ -120,6 +120,10 @@ def test_derivatives_that_an_expert_gives_are_the_analytic_reference(expert):
     exact = np.einsum("bmn,bkn->bkm", sensitive(states)[1], along)
     assert answers.values[:, :, 0] == pytest.approx(exact, abs=1e-5)
     assert np.isfinite(result.evaluation.normalized_return)
+    report = result.report
+    assert report["queries"]["probe"] == report["predicted_queries"]["probe"] > len(states)
+    with pytest.raises(SettingError, match="at most max_queries"):
+        fdtasil.distill(expert, TOY, probes="jacobian", max_queries=1500, **QUICK)
 
 
 @pytest.mark.usefixtures("nothing_is_trained")

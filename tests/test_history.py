@@ -133,3 +133,21 @@ def test_what_a_history_does_not_go_with_is_refused(file):
     dataset = fdtasil.distill(file, TOY, 0, **{**RUN, "history": 1}).dataset
     with pytest.raises(SettingError, match="without an environment"):
         fdtasil.distill(file, None, 3, dataset=dataset, history=2, progress=False)
+
+
+def test_workers_are_given_the_present_alone():
+    slow = fdtasil.load_expert(linear_here, N, M, workers=2, threads=True)
+    result = fdtasil.distill(slow, TOY, 3, **RUN)
+    expected = fdtasil.distill(linear_here, TOY, 3, **RUN)
+    assert np.allclose(result.dataset.answers.values, expected.dataset.answers.values, atol=1e-6)
+
+
+def test_constraints_are_of_the_environments_own_observations(file):
+    seen = []
+
+    def limit(states, actions):
+        seen.append(states.shape[1])
+        return states[:, -1]
+
+    fdtasil.distill(file, TOY, 0, **RUN, constraints={"limit": limit})
+    assert set(seen) == {N}

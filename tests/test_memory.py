@@ -11,8 +11,9 @@ from onnx import TensorProto, helper, numpy_helper
 from toy_environments import Integrator
 
 import fdtasil
-from fdtasil.errors import SettingError
+from fdtasil.errors import ExpertError, SettingError
 from fdtasil.experts.load import load_expert
+from fdtasil.files.onnx.recurrent import find_memory
 from fdtasil.student.schedule import Schedule
 
 pytestmark = pytest.mark.usefixtures("no_pictures")
@@ -231,3 +232,49 @@ def test_a_student_that_can_not_follow_is_named(monkeypatch):
     with pytest.warns(fdtasil.FdtasilWarning, match="does not see the expert's memory") as caught:
         fdtasil.distill(Clock(), TOY, 3, **run, progress=False)
     assert any("fdtasil.Fit(steps=80)" in str(one.message) for one in caught)
+
+
+def test_states_are_paired_by_their_names(file, tmp_path):
+    """Outputs in another order, all of one size, which nothing but names can tell apart."""
+
+    def entry(name):
+        return helper.make_tensor_value_info(name, TensorProto.FLOAT, [1, 1, 5])
+
+    nodes = [
+        helper.make_node("Squeeze", ["h_in", "zero"], ["actions"]),
+        helper.make_node("Add", ["c_in", "c_in"], ["c_out"]),
+        helper.make_node("Add", ["h_in", "one"], ["h_out"]),
+    ]
+    obs = helper.make_tensor_value_info("obs", TensorProto.FLOAT, [1, 5])
+    act = helper.make_tensor_value_info("actions", TensorProto.FLOAT, [1, 5])
+    constants = {"zero": np.array([0], np.int64), "one": np.float32(1)}
+    graph = helper.make_graph(
+        nodes,
+        "crossed",
+        [obs, entry("h_in"), entry("c_in")],
+        [act, entry("c_out"), entry("h_out")],
+        [numpy_helper.from_array(np.asarray(value), name) for name, value in constants.items()],
+    )
+    opset = [helper.make_opsetid("", 17)]
+    model = helper.make_model(graph, opset_imports=opset, ir_version=9)
+    assert find_memory(model, None) == (("h_in", "h_out"), ("c_in", "c_out"))
+
+
+def test_a_memory_that_does_not_begin_with_zeros_is_refused():
+    class Ones(Remembers):
+        def predict(self, observation, state=None, episode_start=None, deterministic=False):
+            rows = len(observation)
+            if state is None:
+                state = np.ones((1, rows, 5), np.float32), np.ones((1, rows, 1), np.float32)
+            return super().predict(observation, state, np.zeros(rows, bool))
+
+    with pytest.raises(ExpertError, match="another memory than zeros"):
+        load_expert(Ones(), N, 2)
+
+
+def test_inspect_and_gains_take_it_too(file, inside):
+    shown = inside("inspect", file, TOY, "--episodes", 2)
+    assert shown.returncode == 0, shown.stderr
+    shown = inside("gains", file, TOY, "--states", 3, "--horizon", 20)
+    assert shown.returncode == 0, shown.stderr
+    assert "Jacobians of 2 x 11" in shown.stdout

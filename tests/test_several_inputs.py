@@ -130,6 +130,29 @@ def test_the_error_lists_every_input_and_what_to_write(grouped, timed):
     assert "memory" not in str(error.value)
 
 
+def test_what_is_left_out_has_the_other_columns(tmp_path):
+    inputs = {
+        "obs": (TensorProto.FLOAT, ["batch", "n"]),
+        "goal": (TensorProto.FLOAT, ["batch", 2]),
+    }
+    nodes = [
+        helper.make_node("Concat", ["obs", "goal"], ["all"], axis=1),
+        helper.make_node("MatMul", ["all", "gain"], ["actions"]),
+    ]
+    path = saved(tmp_path / "e.onnx", inputs, nodes, [("gain", GAIN)])
+    expert = load_expert(path, 5, 2, inputs={"goal": "3:5"})
+    assert expert.ask(ROWS, "act") == pytest.approx(ROWS @ GAIN, abs=1e-5)
+    first = load_expert(path, 5, 2, inputs={"goal": "0:2"})
+    turned = np.concatenate([ROWS[:, 2:], ROWS[:, :2]], axis=1)
+    assert first.ask(ROWS, "act") == pytest.approx(turned @ GAIN, abs=1e-5)
+    with pytest.raises(SettingError, match="is given 3 numbers"):
+        load_expert(path, 5, 2, inputs={"goal": "0:3"})
+    with pytest.raises(SettingError, match="columns up to 6"):
+        load_expert(path, 5, 2, inputs={"goal": "4:6"})
+    with pytest.raises(SettingError, match="inputs= of a function"):
+        load_expert(lambda rows: rows, 5, 5, inputs={"goal": 0.0})
+
+
 def test_one_input_at_most_is_left_out(grouped):
     with pytest.raises(SettingError, match="nothing for 'command' and 'joints' and 'count'"):
         load_expert(grouped, 5, 2, inputs={"height": "3:4"})

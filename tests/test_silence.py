@@ -222,3 +222,43 @@ def test_workers_and_servers_have_no_answer_too():
     expert = load_expert(raising_planner, 5, 2, workers=2, batch=8)
     answers = expert.ask(ROWS, "probe")
     assert np.array_equal(np.isnan(answers).all(axis=1), beyond(ROWS, 1.0))
+
+
+def test_a_copy_has_a_silence_of_its_own(tmp_path):
+    opened = load_expert(nan_planner, 5, 2)
+    opened.ask(ROWS, "probe")
+    result = fdtasil.distill(opened, TOY, 0, **QUICK, progress=False)
+    assert "probe" not in result.report["no_answer"]
+
+
+def test_batches_without_any_answer_are_as_wide_as_others():
+    expert = load_expert(raising_planner, batch=1)
+    answers = expert.ask(ROWS, "probe")
+    assert answers.shape == (40, 2)
+    assert np.array_equal(np.isnan(answers).all(axis=1), beyond(ROWS, 1.0))
+    assert expert.queries == {"probe": 40, "check": beyond(ROWS, 1.0).sum()}
+
+
+def test_the_radius_stays_where_there_are_answers():
+    def on_the_circle(rows):
+        cosine, sine, speed = rows.T
+        answers = np.clip(-8 * np.arctan2(sine, cosine) - 2 * speed, -2, 2)[:, None]
+        answers[np.abs(np.linalg.norm(rows[:, :2], axis=1) - 1) > 0.1] = np.nan
+        return answers
+
+    run = {"episodes": 3, "horizon": 60, "evaluation_episodes": 0, "fit": fdtasil.Fit(steps=40)}
+    result = fdtasil.distill(on_the_circle, "Pendulum-v1", 4, **run, progress=False)
+    assert result.report["radius"] < 0.3
+    assert result.report["no_answer"]["probe"] < 0.5
+
+
+def test_an_end_without_an_answer_moves_to_the_state_before():
+    def last_is_silent(rows):
+        return nan_planner(rows, limit=None)
+
+    states = fdtasil.distill(
+        last_is_silent, TOY, 0, **{**QUICK, "episodes": 8, "horizon": 40}, progress=False
+    ).dataset.demonstrations
+    for number in np.unique(states.episode[states.terminated]):
+        mine = np.flatnonzero(states.episode == number)
+        assert states.terminated[mine].tolist() == [False] * (len(mine) - 1) + [True]

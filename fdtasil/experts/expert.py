@@ -182,13 +182,14 @@ class Expert:
         return rows
 
     def _ask_chunk(self, rows: np.ndarray, ask: Policy) -> np.ndarray:
+        said = None
         try:
             answers = self._checked(rows, ask)
         except _Raised as raised:
-            answers = self._ask_alone(rows, ask, raised)
+            answers, said = self._ask_alone(rows, ask, raised), raised.error
         none = has_none(answers)
         if none.all() and len(none):
-            self._check_control(ask, _not_finite(self, len(rows), none))
+            self._check_control(ask, said or _not_finite(self, len(rows), none))
         elif self.silence.answered is None:
             self.silence.answered = rows[~none][:1].copy()
         return answers
@@ -197,7 +198,7 @@ class Expert:
         """Ask a batch that raised again, row by row, to find those that it belongs to.
 
         Raises:
-            ExpertError: If it belongs to none of them, or to all that it may be asked about.
+            ExpertError: If it belongs to none of them.
         """
         if raised.everywhere:
             raise raised.error
@@ -208,8 +209,6 @@ class Expert:
         answered = [answer for answer in found if answer is not None]
         if len(answered) == len(rows):
             raise raised.error  # of the batch, not of a row
-        if not answered:
-            self._check_control(ask, raised.error)
         self.silence.reason = raised.text
         size = self.action_size or (answered[0].shape[1] if answered else 1)
         none = np.full((1, size), np.nan, np.float32)

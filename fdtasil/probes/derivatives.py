@@ -7,9 +7,9 @@ import torch
 
 from fdtasil.errors import ExpertError, in_one_line
 from fdtasil.experts.expert import Expert
-from fdtasil.probes.gains import gains
+from fdtasil.probes.gains import gain_rows, gains
 
-__all__ = ["differentiate"]
+__all__ = ["check_derivatives", "comparison_rows", "differentiate"]
 
 _STATES = 64  # differentiated at once
 _COMPARED = 4  # states at which an expert's own derivatives are compared with differences
@@ -89,7 +89,6 @@ def _given(
             + ("" if order > 1 else ", or a second value, its (B, m, n) derivatives"),
             probed,
         )
-    _compare(expert, observations)
     parts = []
     for start in range(0, len(observations), _STATES):
         rows = slice(start, start + _STATES)
@@ -126,8 +125,19 @@ def _jacobians(expert: Expert, rows: np.ndarray) -> np.ndarray:
     return found
 
 
-def _compare(expert: Expert, observations: np.ndarray) -> None:
-    """Hold the expert's own derivatives against differences at a few states."""
+def comparison_rows(observation_size: int) -> int:
+    """Return the rows that `check_derivatives` asks for."""
+    return _COMPARED + gain_rows(_COMPARED, observation_size)
+
+
+def check_derivatives(expert: Expert, observations: np.ndarray) -> None:
+    """Hold derivatives that the expert gives itself against differences at a few states.
+
+    Raises:
+        ExpertError: If they are others.
+    """
+    if expert.module is not None or expert.jacobian is None:
+        return
     chosen = np.linspace(0, len(observations) - 1, _COMPARED).astype(int)
     rows = observations[chosen]
     deviation = observations.std(axis=0, dtype=np.float64)

@@ -10,7 +10,7 @@ from fdtasil.experts.expert import Expert
 from fdtasil.experts.load import ExpertLike, load_expert
 from fdtasil.probes.scales import measure_scales
 
-__all__ = ["Gains", "gains"]
+__all__ = ["Gains", "gain_rows", "gains"]
 
 _RUNGS = 4.0 ** np.arange(-9, 1)  # of the ladder, in units of the scale, ascending
 _RAYS = 64  # one coordinate of one state each
@@ -107,6 +107,11 @@ def gains(
         noise * 2**0.5,
         asked.queries["probe"],
     )
+
+
+def gain_rows(states: int, observation_size: int) -> int:
+    """Return the rows that `gains` asks for."""
+    return 2 * len(_RUNGS) * _RAYS + 4 * states * observation_size
 
 
 def _checked(states: object) -> np.ndarray:

@@ -7,6 +7,7 @@ from fdtasil.demonstrations.dataset import Dataset
 from fdtasil.demonstrations.trainers import BehaviourCloning, Trainer, trainer_of
 from fdtasil.errors import SettingError
 from fdtasil.experts.cost import CHEAP, multiply_adds
+from fdtasil.experts.expert import Expert
 from fdtasil.files.storage import sha256
 from fdtasil.probes.directions import USUAL_COUNT
 from fdtasil.probes.source import FRESH, Probes
@@ -118,6 +119,7 @@ class Arguments:
             observation_size=subject.observation_size,
             past=subject.past,
             remembered=subject.remembered,
+            own_derivatives=source is not None and source.exact and _gives_derivatives(expert),
             student_obs=describe_view(self.student_obs, subject.observation_size),
             student=self.student or usual_architecture(anew=bool(source and source.resample)),
             fit=self.fit,
@@ -183,6 +185,10 @@ def read_arguments(
         max_queries=None if max_queries is None else check_count("max_queries", max_queries, 0),
         device=_checked_device(device),
     )
+
+
+def _gives_derivatives(expert: Expert | None) -> bool:
+    return expert is not None and expert.module is None and expert.jacobian is not None
 
 
 def _checked_keep(keep: str, given: Dataset | None) -> str:

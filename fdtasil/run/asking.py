@@ -10,6 +10,7 @@ from fdtasil.errors import SettingError
 from fdtasil.experts.expert import Expert
 from fdtasil.probes.answers import FROM_THE_START, Answers, Beginning, ask_probes
 from fdtasil.probes.calibration import Calibration, calibrate
+from fdtasil.probes.derivatives import check_derivatives, comparison_rows
 from fdtasil.probes.device_twin import DeviceTwin
 from fdtasil.probes.scales import Scales
 from fdtasil.probes.surroundings import Surroundings
@@ -38,6 +39,7 @@ class Asking:
         self._run, self._expert, self._account = run, expert, account
         self.source = run.probes
         self.calibration: Calibration | None = None
+        self._compared = False  # the expert's own derivatives with differences
 
     def calibrate(self, states: np.ndarray, scales: Scales) -> None:
         """Find what the source leaves open, once, on (N, n) states of the first round."""
@@ -92,6 +94,8 @@ class Asking:
         known = 0 if beginning.known is None else len(beginning.known)
         new = len(around.observations) - known
         due = around.probes.queries(new, len(around.live), visits=1)
+        if self._run.own_derivatives:
+            due = new + (0 if self._compared else comparison_rows(around.observations.shape[1]))
         self._account.check_budget(due, self._run.max_queries)
         return self._ask(around, stream, beginning, twin)
 
@@ -109,6 +113,9 @@ class Asking:
         beginning: Beginning,
         twin: DeviceTwin | None,
     ) -> Answers:
+        if self._run.own_derivatives and not self._compared:
+            check_derivatives(self._askable(), around.observations)
+            self._compared = True
         random = generator(self._run.seed, "probes", *stream)
         asked = twin and twin.values
         return ask_probes(self._askable(), around, random, self._run.order, beginning, asked)

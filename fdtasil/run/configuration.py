@@ -10,6 +10,7 @@ from fdtasil.errors import SettingError
 from fdtasil.experts.expert import rows_text
 from fdtasil.experts.gate import GATE_QUERIES, GATE_STATES, large_batch
 from fdtasil.probes.calibration import Ladder, ladder_for
+from fdtasil.probes.derivatives import comparison_rows
 from fdtasil.probes.source import Probes
 from fdtasil.probes.spread import Spread
 from fdtasil.rollouts.survivors import ATTEMPTS, SURVIVORS
@@ -55,6 +56,7 @@ class Configuration:
         reason: How often probes are asked and why, where no caller says which they are.
         past: Length of the past that the student sees.
         remembered: Length of the expert's memory; 0 where it has none.
+        own_derivatives: Whether the expert gives the derivatives that are matched.
     """
 
     expert: str | None
@@ -84,6 +86,7 @@ class Configuration:
     reason: str | None
     past: int = 0
     remembered: int = 0
+    own_derivatives: bool = False
 
     @property
     def held(self) -> range:
@@ -106,6 +109,9 @@ class Configuration:
                 found["act"] += ATTEMPTS * self.rounds[0] * self.horizon
         if self.probes is not None and not self.probes_given:
             found["probe"] = self._predicted_probes(self.probes)
+            if self.own_derivatives:  # a row for each state, and what they are compared with
+                states = self.states or self.episodes * self.horizon
+                found["probe"] = states + comparison_rows(self.observation_size)
             found["calibrate"] = self.ladder.queries if self.calibrated else 0
         if self.expert is not None and self.horizon:
             gates = 2 if self.evaluation_episodes else 1
