@@ -30,6 +30,7 @@ from fdtasil.experts.sizes import size_hint
 from fdtasil.experts.trial import vouch_for
 from fdtasil.experts.workers import BATCH, Workers, check_workers, with_processes, with_threads
 from fdtasil.files.onnx.binding import Inputs, check_inputs
+from fdtasil.files.onnx.recurrent import check_memory
 from fdtasil.rollouts.behaviours import Policy
 
 __all__ = ["KINDS", "ExpertLike", "Kind", "load_expert", "open_expert", "sized"]
@@ -115,14 +116,16 @@ def load_expert(
         raise SettingError(spelt("output", output), "the name of an output", example)
     threads = check_flag("threads", threads)
     bound = None if inputs is None else check_inputs(inputs)
-    hints = Hints(observation_size, action_size, output, trust, timeout, bound, memory)
     kind = _kind_of(source)
-    if (bound or memory) and not isinstance(source, str | Path):
+    pairs = None if memory is None else check_memory(memory)
+    named = bound is not None or pairs is not None
+    if named and not isinstance(source, str | Path):
         raise SettingError(
-            f"{'inputs' if bound else 'memory'}= of a {type(source).__name__}",
+            f"{'memory' if bound is None else 'inputs'}= of a {type(source).__name__}",
             "the path of an ONNX file, whose inputs have names",
             "leave it out",
         )
+    hints = Hints(observation_size, action_size, output, trust, timeout, bound, pairs)
     workers, timeout = check_workers(workers, threads, timeout, kind.remote)
     expert = sized(open_expert(source, hints), observation_size, action_size)
     if batch is None and workers and expert.chunk == CHUNK:

@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from fdtasil.checks import spelt
 from fdtasil.errors import ExpertError, SettingError, shown
 from fdtasil.files.onnx.limits import limit_process
 from fdtasil.files.onnx.session import open_session
@@ -13,12 +14,24 @@ from fdtasil.files.onnx.session import open_session
 if TYPE_CHECKING:
     import onnx
 
-__all__ = ["MEMORY_NAMES", "RecurrentPolicy", "find_memory", "try_recurrent"]
+__all__ = ["MEMORY_NAMES", "RecurrentPolicy", "check_memory", "find_memory", "try_recurrent"]
 
 MEMORY_NAMES = re.compile(
     r"(?i)(^|[^a-z])(h|c)(x|n|0|_?(in|prev|t))?($|[^a-z])|state|hidden|cell|memory|rnn|lstm|gru|carry"
 )
 """What inputs and outputs that hold a memory are usually called."""
+
+
+def check_memory(memory: object) -> Mapping[str, str]:
+    """Refuse what does not say which input comes out of which output.
+
+    Raises:
+        SettingError: If it is something else.
+    """
+    pairs = dict(memory) if isinstance(memory, Mapping) else {}
+    if not pairs or not all(isinstance(text, str) for text in (*pairs, *pairs.values())):
+        raise SettingError(spelt("memory", memory), "inputs and their outputs", _EXAMPLE)
+    return {str(name): str(output) for name, output in pairs.items()}
 
 
 def find_memory(
@@ -41,8 +54,6 @@ def find_memory(
     inputs = {entry.name: entry for entry in model.graph.input if entry.name not in constants}
     outputs = {entry.name: entry for entry in model.graph.output}
     if given is not None:
-        if not isinstance(given, Mapping) or not given:
-            raise SettingError(f"memory={shown(given)[:80]}", "inputs and their outputs", _EXAMPLE)
         for name, there in (
             *((n, inputs) for n in given),
             *((n, outputs) for n in given.values()),
