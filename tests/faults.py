@@ -217,6 +217,15 @@ FAULTS = {
         204: "coordinates that stand still within an episode",
         205: "a demonstration that fell, of an expert that lasts",
     },
+    "what experts lack": {
+        206: "no answer at some states, as NaN, null or an exception",
+        207: "no answer at most states, or at those that had one before",
+        208: "a memory whose parts have other names on the way out, or does not begin with zeros",
+        209: "several inputs, with columns twice, too many, or none",
+        210: "derivatives that are not those of the actions",
+        211: "compiled code with static buffers, asked by several threads",
+        212: "a machine of a cluster that is lost with a batch",
+    },
 }
 
 LEFT_OUT: dict[int, str] = {}

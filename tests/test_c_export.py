@@ -175,6 +175,7 @@ def test_a_c_file_of_others_is_refused(tmp_path):
         fdtasil.load_expert(tmp_path / "other.c")
 
 
+@pytest.mark.fault(211)
 @needs_a_compiler
 def test_threads_do_not_mix_the_buffers_of_compiled_code(quick, tmp_path):
     path = quick.export(tmp_path / "student.c")

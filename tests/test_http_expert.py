@@ -319,6 +319,7 @@ def test_a_timeout_is_a_number_of_seconds():
         fdtasil.load_expert("http://127.0.0.1/act", timeout=-1)
 
 
+@pytest.mark.fault(206)
 @pytest.mark.parametrize("null", [None, [None, None], [1.0, None]], ids=str)
 def test_null_is_no_answer(null, rows):
     def answer(observations):

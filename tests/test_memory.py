@@ -234,6 +234,7 @@ def test_a_student_that_can_not_follow_is_named(monkeypatch):
     assert any("fdtasil.Fit(steps=80)" in str(one.message) for one in caught)
 
 
+@pytest.mark.fault(208)
 def test_states_are_paired_by_their_names(file, tmp_path):
     """Outputs in another order, all of one size, which nothing but names can tell apart."""
 
@@ -260,6 +261,7 @@ def test_states_are_paired_by_their_names(file, tmp_path):
     assert find_memory(model, None) == (("h_in", "h_out"), ("c_in", "c_out"))
 
 
+@pytest.mark.fault(208)
 def test_a_memory_that_does_not_begin_with_zeros_is_refused():
     class Ones(Remembers):
         def predict(self, observation, state=None, episode_start=None, deterministic=False):

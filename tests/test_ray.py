@@ -33,6 +33,7 @@ def cluster():
     ray.shutdown()
 
 
+@pytest.mark.fault(212)
 @pytest.mark.slow
 @pytest.mark.usefixtures("cluster")
 def test_the_bytes_are_those_of_one_process_though_a_worker_is_killed(tmp_path):
