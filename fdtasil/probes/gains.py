@@ -19,6 +19,7 @@ _WINDOW = 2  # rungs below the best one that the error's law is fitted to; above
 # more than that may be truncation, of which it is 9/16, or noise that steps hide from the ladder,
 # of which it is 5: the geometric mean is at most 1.7 times off.
 _BEYOND = (16 / 9 / 5) ** 0.5
+_ROUNDING = float(np.finfo(np.float32).eps)
 _RATIO = 4.0  # of a rung to the one below it
 
 
@@ -162,11 +163,10 @@ def _law(
         told = size > 0  # steps smaller than those of the expert say nothing
         if not told.any():
             continue
+        # Differences that agree to the bit agree to float32's rounding, and no better.
+        squares = np.maximum(squares, np.where(told, size, 1) * _ROUNDING**2)
         best = int(np.where(told, squares / np.where(told, size, 1), np.inf).argmin())
         window = np.arange(max(0, best - _WINDOW), min(len(squares), best + 2))
-        window = window[squares[window] > 0]
-        if not len(window):  # it is linear
-            continue
         design = law[window] / squares[window, None]
         lengths = np.linalg.norm(design, axis=0)  # the columns lie twenty powers of ten apart
         fitted, _ = nnls(design / lengths, np.ones(len(design)))
