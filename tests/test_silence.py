@@ -69,6 +69,10 @@ def test_a_batch_of_states_without_an_answer_is_none_as_long_as_others_have_one(
 
 @pytest.mark.fault(207)
 def test_what_belongs_to_no_row_is_an_error():
+    undefined = load_expert(lambda rows: rows[:, :2] * np.nan)
+    undefined.ask(ROWS[:0], "probe")  # an empty batch is no answer that others are held against
+    with pytest.raises(ExpertError, match="not finite on 40 of 40"):
+        undefined.ask(ROWS, "probe")
     asked = []
 
     def broken(rows):

@@ -188,7 +188,9 @@ class Expert:
         except _Raised as raised:
             answers, said = self._ask_alone(rows, ask, raised), raised.error
         none = has_none(answers)
-        if none.all() and len(none):
+        if not len(none):  # says nothing of what the expert answers
+            return answers
+        if none.all():
             self._check_control(ask, said or _not_finite(self, len(rows), none))
         elif self.silence.answered is None:
             self.silence.answered = rows[~none][:1].copy()

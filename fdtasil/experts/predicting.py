@@ -3,7 +3,6 @@
 import inspect
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -87,9 +86,8 @@ def _carried(
     axes = [_axis(*parts) for parts in zip(*map(_leaves, states), strict=True)]
     if None in axes:  # no memory of rows
         return None
-    step = _Carries(asked, statistics, options, tuple(axis or 0 for axis in axes))
-    first = _flat(_leaves(states[0]), step.axes)
-    memory = Memory(first.shape[1], step)
+    step = _Carries(asked, statistics, options, states[0], tuple(axis or 0 for axis in axes))
+    memory = Memory(_flat(_leaves(states[0]), step.axes).shape[1], step)
     _check_start(asked, step, memory.size, observation_size, name)
     n = observation_size
     return Expert(stateless(step, n), name, n + memory.size, memory=memory)
@@ -137,7 +135,7 @@ def _flat(parts: list[np.ndarray], axes: tuple[int, ...]) -> np.ndarray:
     return np.concatenate([part.reshape(len(part), -1) for part in moved], 1).astype(np.float32)
 
 
-@dataclass
+@dataclass(frozen=True)
 class _Carries:
     """An object's `predict`, with its state as one vector a row.
 
@@ -145,12 +143,14 @@ class _Carries:
         source: Has `predict(observation, state, episode_start)`.
         statistics: The VecNormalize that it was trained in, or None.
         options: What `predict` is called with besides.
+        like: A state, for the kinds and shapes of its parts.
         axes: Of rows, in each part of a state.
     """
 
     source: Any
     statistics: Any
     options: Mapping[str, bool]
+    like: Any
     axes: tuple[int, ...]
 
     def __call__(
@@ -158,30 +158,19 @@ class _Carries:
     ) -> tuple[np.ndarray, np.ndarray]:
         if self.statistics is not None:
             observations = self.statistics.normalize_obs(observations)
-        rows, like = len(observations), self._like(observations.shape[1])
-        parts, start = [], 0
-        for part, axis in zip(_leaves(like), self.axes, strict=True):
+        rows, parts, start = len(observations), [], 0
+        for part, axis in zip(_leaves(self.like), self.axes, strict=True):
             shape = np.moveaxis(part, axis, 0).shape[1:]
             stop = start + int(np.prod(shape))
             moved = memories[:, start:stop].reshape(rows, *shape).astype(part.dtype)
             parts.append(np.ascontiguousarray(np.moveaxis(moved, 0, axis)))
             start = stop
-        state = tuple(parts) if isinstance(like, tuple | list) else parts[0]
+        state = tuple(parts) if isinstance(self.like, tuple | list) else parts[0]
         begun = np.zeros(rows, bool)
         actions, after = self.source.predict(
             observations, state=state, episode_start=begun, **self.options
         )
         return actions, _flat(_leaves(after), self.axes)
-
-    @cached_property
-    def _first(self) -> dict[int, Any]:
-        return {}
-
-    def _like(self, n: int) -> Any:
-        """Return a state of two rows, for the shapes of its parts."""
-        if n not in self._first:
-            self._first[n] = _ask_first(self.source, 2, n, self.options)
-        return self._first[n]
 
 
 def _asked(source: Any) -> Any:

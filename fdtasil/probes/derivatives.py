@@ -8,11 +8,13 @@ import torch
 from fdtasil.errors import ExpertError, in_one_line
 from fdtasil.experts.expert import Expert
 from fdtasil.probes.gains import gain_rows, gains
+from fdtasil.probes.scales import measure_scales
 
 __all__ = ["check_derivatives", "comparison_rows", "differentiate"]
 
 _STATES = 64  # differentiated at once
 _COMPARED = 4  # states at which an expert's own derivatives are compared with differences
+_PROBED = 'probe it instead: probes="basis" or probes=10'
 _APART = 3  # errors of a difference that they may lie apart, and
 _TOLERATED = 0.02  # of the derivatives' norm
 
@@ -40,20 +42,30 @@ def differentiate(
         ExpertError: If the expert can't be differentiated, or its own derivatives are not those
             of its actions.
     """
-    module = expert.module
-    if module is None:
-        return _given(expert, observations, directions, numbers, order)
-    like = next(module.parameters(), torch.zeros(()))
-    along = torch.func.vmap(_derivatives_along(module, order), in_dims=(None, 0))
-    every = torch.func.vmap(along)
+    along = _of_module(expert.module, order) if expert.module else _of_the_expert(expert, order)
     parts = []
     for start in range(0, len(observations), _STATES):
         rows = slice(start, start + _STATES)
-        states = torch.from_numpy(observations[rows]).to(like.device, like.dtype)
-        moved = torch.from_numpy(directions[numbers[rows]]).to(like.device, like.dtype)
-        with torch.no_grad():
-            parts.append(every(states, moved).float().cpu().numpy())
+        parts.append(along(observations[rows], directions[numbers[rows]]))
     return np.concatenate(parts)
+
+
+Along = Callable[[np.ndarray, np.ndarray], np.ndarray]
+"""(B, n) states and (B, k, n) directions -> (B, k, order, m) float32 derivatives."""
+
+
+def _of_module(module: torch.nn.Module, order: int) -> Along:
+    like = next(module.parameters(), torch.zeros(()))
+    every = torch.func.vmap(torch.func.vmap(_derivatives_along(module, order), in_dims=(None, 0)))
+
+    def along(states: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        where = [
+            torch.from_numpy(part).to(like.device, like.dtype) for part in (states, directions)
+        ]
+        with torch.no_grad():
+            return every(*where).float().cpu().numpy()
+
+    return along
 
 
 def _derivatives_along(
@@ -73,29 +85,25 @@ def _derivatives_along(
     return derivatives
 
 
-def _given(
-    expert: Expert,
-    observations: np.ndarray,
-    directions: np.ndarray,
-    numbers: np.ndarray,
-    order: int,
-) -> np.ndarray:
-    """Return the derivatives along directions, from those that the expert gives."""
-    probed = 'probe it instead: probes="basis" or probes=10'
+def _of_the_expert(expert: Expert, order: int) -> Along:
+    """Take the derivatives that the expert gives itself.
+
+    Raises:
+        ExpertError: If it gives none, or none of this order.
+    """
     if expert.jacobian is None or order > 1:
         raise ExpertError(
             f"{expert.name} can't be differentiated" + (" twice" if expert.jacobian else ""),
             "a torch module, or an ONNX file made of the operators of an MLP"
             + ("" if order > 1 else ", or a second value, its (B, m, n) derivatives"),
-            probed,
+            _PROBED,
         )
-    parts = []
-    for start in range(0, len(observations), _STATES):
-        rows = slice(start, start + _STATES)
-        jacobians = _jacobians(expert, observations[rows])
-        moved = directions[numbers[rows]]
-        parts.append(np.einsum("bmn,bkn->bkm", jacobians, moved)[:, :, None])
-    return np.concatenate(parts).astype(np.float32)
+
+    def along(states: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        found = np.einsum("bmn,bkn->bkm", _jacobians(expert, states), directions)
+        return found[:, :, None].astype(np.float32)
+
+    return along
 
 
 def _jacobians(expert: Expert, rows: np.ndarray) -> np.ndarray:
@@ -109,7 +117,7 @@ def _jacobians(expert: Expert, rows: np.ndarray) -> np.ndarray:
         raise ExpertError(
             f"{expert.name} can't be differentiated: {in_one_line(error)}",
             expected,
-            'probe it instead: probes="basis" or probes=10',
+            _PROBED,
         ) from error
     right = found.ndim == 3 and found.shape[::2] == rows.shape
     if not right or found.shape[1] != (expert.action_size or found.shape[1]):
@@ -140,10 +148,9 @@ def check_derivatives(expert: Expert, observations: np.ndarray) -> None:
         return
     chosen = np.linspace(0, len(observations) - 1, _COMPARED).astype(int)
     rows = observations[chosen]
-    deviation = observations.std(axis=0, dtype=np.float64)
-    scale = np.where(deviation > 0, deviation, 1.0)
+    scale = measure_scales(observations).units
     given, found = _jacobians(expert, rows), gains(expert, rows, scale=scale)
-    expert.queries["probe"] += found.queries
+    expert.count(found.queries, "probe")
     apart = np.sqrt(np.nanmean(((given - found.jacobian) * scale) ** 2, axis=0))
     size = np.linalg.norm(np.sqrt(np.nanmean((found.jacobian * scale) ** 2, axis=0)))
     bound = _APART * np.linalg.norm(found.error * scale) + _TOLERATED * size

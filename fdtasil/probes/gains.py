@@ -131,8 +131,7 @@ def _checked(states: object) -> np.ndarray:
 
 def _units(rows: np.ndarray, scale: np.ndarray | None) -> np.ndarray:
     if scale is None:
-        scales = measure_scales(rows)
-        return np.where(scales.live, scales.deviation, 1.0)
+        return measure_scales(rows).units
     units = np.asarray(scale, np.float64)
     if units.shape != rows.shape[1:] or not (np.isfinite(units) & (units > 0)).all():
         found = f"scale of shape {units.shape}, from {units.min(initial=0):g}"

@@ -39,6 +39,11 @@ class Scales:
     seen: np.ndarray
     told: np.ndarray
 
+    @property
+    def units(self) -> np.ndarray:
+        """(n,) the deviation of each coordinate; 1 for those that do not move."""
+        return np.where(self.live, self.deviation, 1.0)
+
     def spread_by(self, deviations: Mapping[int, float]) -> "Scales":
         """Return the scales with coordinates that are said to vary by other deviations."""
         if not deviations:

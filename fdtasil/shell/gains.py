@@ -60,8 +60,7 @@ def command(
         asked = looked.expert
         assert asked is not None, "who acted was opened"
         visited = looked.own.observations[looked.own.valid]
-        scales = measure_scales(visited)
-        scale = np.where(scales.live, scales.deviation, 1.0)
+        scale = measure_scales(visited).units
         chosen = looked.own.spread(states)
         found = gains(asked, chosen, scale=scale, seed=seed)
     print(_summary(found))

@@ -31,6 +31,8 @@ __all__ = ["CALL_SECONDS", "MEMORY", "limit_memory", "limit_process", "run_withi
 CALL_SECONDS = 60.0
 MEMORY = 4 * 2**30  # bytes, for all models of a process together
 _FOLDED = 128 * 2**20  # bytes of a constant that onnxruntime computes while it opens a model
+# Beside the models' own memory: the libraries, and copies of a model while it is opened.
+_ROOM, _COPIES = 2**30, 6
 _LOOKS = 20  # in the seconds of a call
 
 
@@ -43,14 +45,14 @@ def limit_memory(options: "onnxruntime.SessionOptions") -> None:
     )
 
 
-def limit_process(more: int) -> None:
-    """Limit this process to the memory of a model and `more` bytes, where the system can.
+def limit_process(size: int) -> None:
+    """Limit this process to the memory of a model of `size` bytes, where the system can.
 
     Address space would count what onnxruntime only reserves, so what is written to is limited.
     """
     if _resource is None:
         return
-    most = MEMORY + more
+    most = MEMORY + _ROOM + _COPIES * size
     for limit, value in ((_resource.RLIMIT_DATA, most), (_resource.RLIMIT_CORE, 0)):
         hard = _resource.getrlimit(limit)[1]
         unlimited = hard == _resource.RLIM_INFINITY

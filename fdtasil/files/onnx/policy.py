@@ -24,8 +24,6 @@ if TYPE_CHECKING:
 __all__ = ["OnnxPolicy", "cannot_be_asked", "open_policy", "open_within_limits"]
 
 _FLOATS = ("tensor(float)", "tensor(double)", "tensor(float16)")
-# Beside the models' own memory: the libraries, and copies of a model while it is opened.
-_ROOM, _COPIES = 2**30, 6
 
 
 class OnnxPolicy:
@@ -156,7 +154,7 @@ def open_within_limits(
         output: As there.
         straight: Whether it is also asked what a torch twin of it is compared on.
     """
-    limit_process(_ROOM + _COPIES * len(data))
+    limit_process(len(data))
     warnings.simplefilter("ignore", FdtasilWarning)  # the parent opens it again, and warns
     policy, n, _ = open_policy(data, name, observation_size, action_size, output)
     if straight:

@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -197,14 +197,7 @@ def _as(value: np.ndarray, kind: str) -> np.ndarray:
     return np.ascontiguousarray(value, types.get(kind, np.float32))
 
 
-def try_recurrent(
-    data: bytes,
-    name: str,
-    pairs: tuple[tuple[str, str], ...],
-    size: int | None,
-    action_size: int | None,
-    output: str | None,
-) -> None:
-    """Open a model and ask it once, in a process that may be killed for it."""
-    limit_process(2**30 + 6 * len(data))
-    RecurrentPolicy(data, name, pairs, size, action_size, output)
+def try_recurrent(data: bytes, *rest: Any) -> None:
+    """Open a model and ask it once, in a process that may be killed for it; see the class."""
+    limit_process(len(data))
+    RecurrentPolicy(data, *rest)
