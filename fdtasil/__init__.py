@@ -38,6 +38,7 @@ if TYPE_CHECKING:
     from fdtasil.probes.source import Probes
     from fdtasil.results.distilled import Distilled
     from fdtasil.results.evaluation import Evaluation
+    from fdtasil.rollouts.wanted import Environment
     from fdtasil.run.events import Event, Log
     from fdtasil.run.pipeline import distill, evaluate
     from fdtasil.student.architectures import Mlp
@@ -50,6 +51,7 @@ __all__ = [
     "Dart",
     "Dataset",
     "Distilled",
+    "Environment",
     "Evaluation",
     "Event",
     "Expert",
@@ -83,6 +85,7 @@ _ROOMS = {
     "probes.source": ("Probes",),
     "results.distilled": ("Distilled",),
     "results.evaluation": ("Evaluation",),
+    "rollouts.wanted": ("Environment",),
     "run.events": ("Event", "Log"),
     "run.pipeline": ("distill", "evaluate"),
     "student.architectures": ("Mlp",),

@@ -98,11 +98,9 @@ def test_what_is_refused(reason, plain):
 
 
 @pytest.mark.fault(43, 50)
-def test_real_gsde_and_discrete_agents_are_refused(save):
+def test_a_real_gsde_agent_is_refused(save):
     with pytest.raises(ExpertError, match="gSDE"):
         read_agent(save(make_agent("SAC", use_sde=True)))
-    with pytest.raises(ExpertError, match="Discrete"):
-        read_agent(save(make_agent("PPO", "CartPole-v1")))
 
 
 @pytest.mark.fault(46)

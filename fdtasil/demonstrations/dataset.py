@@ -19,6 +19,7 @@ from fdtasil.files.reading import from_json, read_plain
 from fdtasil.files.storage import is_written, verify
 from fdtasil.probes.answers import Answers
 from fdtasil.probes.source import Probes
+from fdtasil.rollouts.spaces import Spaces
 
 __all__ = ["Dataset", "DatasetLike", "check_dataset", "check_shapes", "load_dataset"]
 
@@ -36,6 +37,7 @@ class Dataset:
         low: (m,) lower action bounds; -inf where there is none.
         high: (m,) upper action bounds.
         environment: What the environment is called.
+        spaces: Of the environment, where they are no plain boxes.
     """
 
     demonstrations: Demonstrations
@@ -44,6 +46,7 @@ class Dataset:
     low: np.ndarray
     high: np.ndarray
     environment: str
+    spaces: Spaces | None = None
 
     @property
     def sizes(self) -> tuple[int, int]:
@@ -60,17 +63,20 @@ class Dataset:
         `low` and `high` (m,) float32; with probes also `displacements` (P, n) float32, `numbers`
         (N, k) int32, `values` (N, k, p, m) float32 and `gains` (P,) float64 as in `Answers` (one
         `gain` () in version 1); and
-        `about`, JSON text as bytes: version, environment, probes.
+        `about`, JSON text as bytes: version, environment, probes, and spaces where they are no
+        plain boxes.
         """
         arrays: dict[str, Any] = dict(vars(self.demonstrations))
         arrays |= {"low": self.low, "high": self.high}
         if self.answers is not None:
             arrays |= vars(self.answers)
-        about = {
+        about: dict[str, Any] = {
             "version": _VERSION,
             "environment": self.environment,
             "probes": self.probes.describe() if self.probes else "none",
         }
+        if self.spaces is not None:
+            about["spaces"] = self.spaces.to_json()
         arrays["about"] = np.frombuffer(json.dumps(about).encode(), np.uint8)
         target = io.BytesIO()
         np.savez(target, **arrays)
@@ -267,7 +273,11 @@ def _read(arrays: Mapping[str, np.ndarray]) -> Dataset:
             raise ValueError("gains that are not positive numbers")
         answers = Answers(bank, numbers, values, gains)
     bounds = typed["low"], typed["high"]
-    return Dataset(demonstrations, _probes(spec, answers), answers, *bounds, environment)
+    spaces = Spaces.from_json(about["spaces"]) if "spaces" in about else None
+    found = Dataset(demonstrations, _probes(spec, answers), answers, *bounds, environment, spaces)
+    if spaces and spaces.actions.size != found.sizes[1]:
+        raise ValueError("actions of another size than their space")
+    return found
 
 
 def _probes(spec: str, answers: Answers | None) -> Probes | None:

@@ -21,6 +21,7 @@ __all__ = [
     "NoisyExpert",
     "Situation",
     "Trainer",
+    "check_choices",
     "describe_trainer",
     "trainer_of",
 ]
@@ -40,6 +41,7 @@ class Situation:
         student: The last round's policy; None in round 0.
         record: Behaviour and number of episodes -> that many extra episodes of the round, which
             are not labelled; their expert rows count.
+        chooses: Whether actions are scores of choices.
     """
 
     round: int
@@ -47,6 +49,7 @@ class Situation:
     half_range: np.ndarray
     student: Policy | None
     record: Callable[[Behaviour, int], Episodes]
+    chooses: bool = False
 
 
 class Trainer(Protocol):
@@ -100,7 +103,7 @@ class DAgger:
         beta: Share of the expert: a number b for b**round, or a function of the round. With a
             share of 0 the student acts alone, and the states are labelled afterwards.
         mix: "blend" (TaSIL: the convex combination of the two actions) or "switch" (the original:
-            one of the two, drawn at each step).
+            one of the two, drawn at each step); choices are always switched.
     """
 
     updates: tuple[int, ...] = UPDATES
@@ -128,7 +131,8 @@ class DAgger:
         if student is None:
             return _expert_acts(expert)
         share = self.share(situation.round)
-        mix = _blend if self.mix == "blend" else _switch
+        # Nobody has chosen what is best by the mean of two scores.
+        mix = _blend if self.mix == "blend" and not situation.chooses else _switch
 
         def act(observations: np.ndarray, noise: Sequence[np.random.Generator]) -> Decision:
             own = student(observations)
@@ -295,6 +299,20 @@ TRAINERS: dict[str, Callable[[], Trainer]] = {
     "dart": Dart,
     "noise": NoisyExpert,
 }
+
+
+def check_choices(trainer: Trainer) -> None:
+    """Refuse a trainer that adds noise to actions, where they are choices.
+
+    Raises:
+        SettingError: If it is one.
+    """
+    if isinstance(trainer, Dart | NoisyExpert):
+        raise SettingError(
+            f"trainer={trainer.name!r}, which adds noise to actions, where actions are choices",
+            "a trainer without noise: there is nothing between two choices",
+            'write trainer="dagger", or leave it out',
+        )
 
 
 def describe_trainer(trainer: Trainer) -> str:

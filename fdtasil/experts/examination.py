@@ -10,7 +10,7 @@ from fdtasil.errors import ExpertError, warn
 from fdtasil.experts.carrying import carry
 from fdtasil.experts.expert import Expert
 from fdtasil.experts.gate import GATE_STATES, Finding, admit_expert, examine_expert
-from fdtasil.experts.load import ExpertLike, load_expert
+from fdtasil.experts.load import ExpertLike, expert_in
 from fdtasil.progress import Progress
 from fdtasil.rollouts.behaviours import follow_answers, random_behaviour
 from fdtasil.rollouts.environments import EnvironmentPool, resolve_horizon
@@ -143,7 +143,7 @@ def look_closely(
     boxes, length = pool.boxes, resolve_horizon(horizon, pool)
     sizes = boxes.observation_size, boxes.action_size
     try:
-        expert = load_expert(source, *sizes)
+        expert = expert_in(source, pool)
     except ExpertError as error:
         return Looked([Finding("opening", error.found, error)])
     expert, _, remembered = carry(expert, pool)

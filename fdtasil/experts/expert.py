@@ -14,6 +14,7 @@ from fdtasil.experts.sb3.trust import Trust
 from fdtasil.experts.silence import Silence
 from fdtasil.experts.worker_process import as_array
 from fdtasil.rollouts.behaviours import Policy, has_none
+from fdtasil.rollouts.spaces import Spaces
 
 __all__ = ["Expert", "Hints", "Purpose", "RaisedElsewhere"]
 
@@ -36,6 +37,7 @@ class Hints:
         memory: Inputs that hold a memory, and the outputs that it comes out of.
         trust: "pickle" where code inside a file may be run.
         timeout: Seconds that a batch may take, or None.
+        spaces: Of the environment, or None.
     """
 
     observation_size: int | None = None
@@ -45,6 +47,7 @@ class Hints:
     timeout: float | None = None
     inputs: Mapping[str, slice | np.ndarray] | None = None
     memory: Mapping[str, str] | None = None
+    spaces: Spaces | None = None
 
 
 class RaisedElsewhere(Exception):
@@ -94,6 +97,9 @@ class Expert:
         workers: Who answer chunks side by side instead of `answer`, or None; copies share them.
         queries: Rows asked so far, by purpose.
         silence: Where it had no answer; copies share it as they share the queries.
+        own_form: Whether it takes observations as an environment has them, in a batch:
+            dictionaries, stacks of frames; others take flat rows.
+        spaces: Those that it was opened in, where they are no plain boxes; see `structure.py`.
 
     Example:
         >>> import numpy as np
@@ -118,6 +124,8 @@ class Expert:
     jacobian: Callable[[np.ndarray], np.ndarray] | None = None
     memory: Memory | None = None
     takes: tuple[int, ...] | None = None
+    own_form: bool = False
+    spaces: Spaces | None = None
 
     def ask(self, observations: np.ndarray, purpose: Purpose) -> np.ndarray:
         """Answer a batch and count its rows.

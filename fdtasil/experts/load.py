@@ -27,13 +27,15 @@ from fdtasil.experts.sb3.agent import read_agent
 from fdtasil.experts.sb3.trust import Trust
 from fdtasil.experts.silence import Silence
 from fdtasil.experts.sizes import size_hint
+from fdtasil.experts.structure import in_spaces
 from fdtasil.experts.trial import vouch_for
 from fdtasil.experts.workers import BATCH, Workers, check_workers, with_processes, with_threads
 from fdtasil.files.onnx.binding import Inputs, check_inputs
 from fdtasil.files.onnx.recurrent import check_memory
 from fdtasil.rollouts.behaviours import Policy
+from fdtasil.rollouts.environments import EnvironmentPool
 
-__all__ = ["KINDS", "ExpertLike", "Kind", "load_expert", "open_expert", "sized"]
+__all__ = ["KINDS", "ExpertLike", "Kind", "expert_in", "load_expert", "open_expert", "sized"]
 
 
 @runtime_checkable
@@ -145,6 +147,19 @@ def load_expert(
     return with_processes(expert, _opener(source, expert, hints), workers, timeout)
 
 
+def expert_in(source: ExpertLike, pool: EnvironmentPool) -> Expert:
+    """Open an expert for an environment, whose own form of observations it may take.
+
+    Raises:
+        ExpertError: If it can't be opened, or does not fit the environment.
+    """
+    n, m = pool.boxes.observation_size, pool.boxes.action_size
+    if pool.spaces.plain:
+        return load_expert(source, n, m)
+    hints = Hints(n, m, spaces=pool.spaces)
+    return sized(in_spaces(open_expert(source, hints), pool.spaces), n, m)
+
+
 def open_expert(source: ExpertLike, hints: Hints) -> Expert:
     """Open an expert whose sizes may be others than those hinted at; see `load_expert`."""
     if isinstance(source, str | Path):
@@ -244,9 +259,11 @@ def _from_agent(path: str | Path, hints: Hints) -> Expert:
 
 def _from_torch(module: torch.nn.Module, hints: Hints) -> Expert:
     """Ask a module by calling it, unless it has a `predict` that answers otherwise."""
-    if not isinstance(module, Predictor) or _is_the_policy(module, hints.observation_size):
+    if getattr(module, "takes_flat_rows", False):  # a student of ours
         return open_module(module)
-    return open_predictor(module, hints.observation_size)
+    if not isinstance(module, Predictor) or _is_the_policy(module, hints.observation_size):
+        return dataclasses.replace(open_module(module), own_form=True)
+    return _from_predictor(module, hints)
 
 
 def _is_the_policy(module: torch.nn.Module, observation_size: int | None) -> bool:
@@ -257,18 +274,24 @@ def _is_the_policy(module: torch.nn.Module, observation_size: int | None) -> boo
     try:
         called = open_module(module).answer(rows.copy())
         asked = open_predictor(module).answer(rows.copy())
-    except (AttributeError, RuntimeError, TypeError, ValueError):
+    except (AttributeError, LookupError, RuntimeError, TypeError, ValueError):
         return False
     return np.shape(called) == np.shape(asked) and np.allclose(called, asked, atol=1e-5)
 
 
 def _from_predictor(source: Predictor, hints: Hints) -> Expert:
-    return open_predictor(source, hints.observation_size)
+    # What remembers takes flat rows, with the memory behind them.
+    flat = hints.spaces is None or hints.spaces.observations.plain
+    chooses = hints.spaces is not None and bool(hints.spaces.actions.choices)
+    n = hints.observation_size if flat else None
+    found = open_predictor(source, n, chooses=chooses)
+    return dataclasses.replace(found, own_form=found.memory is None)
 
 
 def _from_function(function: Callable[[np.ndarray], np.ndarray], hints: Hints) -> Expert:
     name = getattr(function, "__name__", type(function).__name__)
-    return Expert(function, f"the function {name}", jacobian=own_jacobian(function))
+    given = own_jacobian(function)
+    return Expert(function, f"the function {name}", jacobian=given, own_form=True)
 
 
 def _is_path(source: object) -> bool:

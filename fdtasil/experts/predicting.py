@@ -1,7 +1,7 @@
 """Objects with a `predict`, such as stable-baselines3's agents, with what stands beside them."""
 
 import inspect
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -11,6 +11,7 @@ from fdtasil.errors import ExpertError, warn
 from fdtasil.experts.expert import Expert
 from fdtasil.experts.memory import Memory, stateless
 from fdtasil.experts.own_jacobian import own_jacobian
+from fdtasil.experts.sb3.scores import scores_of
 
 __all__ = ["open_predictor"]
 
@@ -19,11 +20,18 @@ _HARMLESS = {"VecMonitor", "VecCheckNan", "VecVideoRecorder", "VecNormalize"}
 _ITS_OWN = "stable_baselines3.common.base_class"
 
 
-def open_predictor(source: Any, observation_size: int | None = None) -> Expert:
+def open_predictor(
+    source: Any, observation_size: int | None = None, *, chooses: bool = False
+) -> Expert:
     """Ask an object by its `predict`; one that returns a state has a memory.
 
     An agent that was trained in VecNormalize is asked about what that makes of an observation, as
     its own library does.
+
+    Args:
+        source: The object.
+        observation_size: n, where observations are flat; else it is taken to have no memory.
+        chooses: Whether its actions are choices; an agent's scores are asked for in their place.
 
     Raises:
         ExpertError: If it was trained on observations that another wrapper made.
@@ -36,7 +44,10 @@ def open_predictor(source: Any, observation_size: int | None = None) -> Expert:
         carried = _carried(source, name, options, observation_size)
         if carried is not None:
             return carried
-    answer = _Predicts(_asked(source), name, options, _statistics(source))
+    asked = _asked(source)
+    # DQN has a predict of its own, which is the policy's where nothing is random.
+    scores = scores_of(getattr(source, "policy", source)) if chooses else None
+    answer = _Predicts(asked, name, options, _statistics(source), scores)
     return Expert(answer, name, jacobian=own_jacobian(source))
 
 
@@ -49,16 +60,20 @@ class _Predicts:
         name: What to call it.
         options: What `predict` is called with besides.
         statistics: The VecNormalize that it was trained in, or None.
+        scores: What it chooses by, asked in its place; or None.
     """
 
     source: Any
     name: str
     options: Mapping[str, bool]
     statistics: Any
+    scores: Callable[[Any], np.ndarray] | None = None
 
     def __call__(self, observations: np.ndarray) -> np.ndarray:
         if self.statistics is not None:
             observations = self.statistics.normalize_obs(observations)
+        if self.scores is not None:
+            return self.scores(observations)
         result = self.source.predict(observations, **self.options)
         if not isinstance(result, tuple):
             return result

@@ -2,6 +2,7 @@
 
 import csv
 import io
+import json
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -91,13 +92,16 @@ class Distilled:
         """The expert's answers to the probes, or None."""
         return self.dataset.answers
 
-    def export(self, path: str | Path) -> Path:
+    def export(self, path: str | Path, inputs: str = "flat") -> Path:
         """Write the student as the file that the suffix of a path asks for.
 
         Args:
             path: Ends with ".onnx" (input `obs` (batch, n), output `actions`, normaliser and
                 action bounds inside; `metadata_props` says the rest), ".safetensors", ".c" (C99
                 without malloc; `-DSTUDENT_MAIN` makes it a program of lines) or ".h", its header.
+                Where actions are choices, the ONNX file has the outputs `scores` and `actions`.
+            inputs: "flat", or "keys" for an ONNX file with one input for each part of a
+                dictionary.
 
         Raises:
             SettingError: If there is no such target.
@@ -105,7 +109,7 @@ class Distilled:
                 differ from torch's by more than 1e-5.
             StorageError: If it can't be written.
         """
-        write_bytes(Path(path), self.export_bytes(path))
+        write_bytes(Path(path), self.export_bytes(path, inputs))
         return Path(path)
 
     def to_onnx(self, path: str | Path) -> Path:
@@ -113,11 +117,12 @@ class Distilled:
         write_bytes(Path(path), self.export_bytes("student.onnx"))
         return Path(path)
 
-    def export_bytes(self, name: str | Path) -> bytes:
+    def export_bytes(self, name: str | Path, inputs: str = "flat") -> bytes:
         """Return what `export` writes to a file of that name."""
         states = self.demonstrations.observations
         chosen = np.linspace(0, len(states) - 1, min(len(states), _PARITY_STATES)).astype(int)
-        return export(self.student, self.view.look(states[chosen]), self._metadata(), name)
+        seen = self.view.look(states[chosen])
+        return export(self.student, seen, self._metadata(), name, inputs)
 
     def save(self, folder: str | Path) -> Path:
         """Write the run folder.
@@ -191,6 +196,8 @@ class Distilled:
             "fdtasil.action_high": ",".join(f"{value:g}" for value in high),
             "fdtasil.expert_sha256": self.report["expert"]["sha256"] or "",
         }
+        if self.student.spaces is not None:
+            metadata["fdtasil.spaces"] = json.dumps(self.student.spaces.to_json())
         if self.view.columns is not None:
             metadata[COLUMNS] = ",".join(map(str, self.view.columns))
         if self.evaluation is not None:

@@ -12,10 +12,11 @@ from fdtasil.experts.expert import Expert
 from fdtasil.files.plain import from_plain, to_plain
 from fdtasil.probes.scales import measure_scales
 from fdtasil.progress import Progress
-from fdtasil.rollouts.behaviours import Behaviour, random_behaviour
+from fdtasil.rollouts.behaviours import Behaviour, has_none, random_behaviour
 from fdtasil.rollouts.environments import EnvironmentPool
 from fdtasil.rollouts.episodes import Episodes
 from fdtasil.rollouts.rollout import rollout
+from fdtasil.rollouts.spaces import Layout
 from fdtasil.seeding import generator
 
 __all__ = [
@@ -64,6 +65,8 @@ class Evaluation:
             nothing and there is no normalised one.
         violations: Of each constraint its name, and the share of the steps at which the expert
             and the student violated it.
+        agreement: Where actions are choices, the share of the student's own states at which it
+            chooses as the expert does; else None.
     """
 
     episodes: int
@@ -82,6 +85,7 @@ class Evaluation:
     expert_physics_resets: int = 0
     physics_resets: int = 0
     violations: tuple[tuple[str, float, float], ...] = ()
+    agreement: float | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Return the evaluation as plain JSON values."""
@@ -101,13 +105,15 @@ class Evaluation:
             "student's"
             for name, theirs, ours in self.violations
         )
+        agrees = self.agreement
+        same = "" if agrees is None else f"\n  agreement         {agrees:10.3f}   of its choices"
         return (
             f"{self.episodes} paired episodes of {self.horizon} steps\n"
             f"  expert            {expert}\n"
             f"  student           {student}\n"
             f"  normalised return {share}\n"
             f"  action error      {self.action_error:10.3f}   on the student's own states"
-            f"{kept}"
+            f"{same}{kept}"
         )
 
 
@@ -163,8 +169,9 @@ def evaluate_pair(
         meaningful = False
     visited = student_episodes.observations[student_episodes.valid]
     acted = student_episodes.actions[student_episodes.valid]
-    distance = np.linalg.norm(acted - expert.ask(visited, "evaluate"), axis=1)
-    distance = distance[~np.isnan(distance)]  # where the expert has an answer
+    said = expert.ask(visited, "evaluate")
+    heard = ~has_none(said)  # where the expert has an answer
+    distance = np.linalg.norm(acted[heard] - said[heard], axis=1)
     return Evaluation(
         episodes=len(seeds),
         horizon=horizon,
@@ -185,7 +192,15 @@ def evaluate_pair(
             (name, broken[name], _violated(name, constraint, student_episodes, pool, own))
             for name, constraint in (constraints or {}).items()
         ),
+        agreement=_agreement(pool.spaces.actions, acted[heard], said[heard]),
     )
+
+
+def _agreement(actions: Layout, ours: np.ndarray, theirs: np.ndarray) -> float | None:
+    """Return the share of the rows whose choices are all the same."""
+    if not actions.choices or not len(ours):
+        return None
+    return float((actions.best(ours) == actions.best(theirs)).all(axis=1).mean())
 
 
 def _survival(episodes: Episodes) -> float:

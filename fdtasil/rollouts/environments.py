@@ -1,4 +1,4 @@
-"""What an environment argument means: an id, an instance or a factory, and its two boxes."""
+"""What an environment argument means: an id, an instance or a factory, and its two spaces."""
 
 import warnings
 from collections.abc import Callable, Iterator
@@ -13,15 +13,23 @@ import numpy as np
 from fdtasil.checks import check_count
 from fdtasil.compute import in_turn
 from fdtasil.errors import EnvironmentFault, SettingError, first_line, warn
+from fdtasil.rollouts.flattening import Flat, bounds_of
+from fdtasil.rollouts.spaces import Layout, Spaces, UnknownSpace, layout_of
+from fdtasil.rollouts.vector import Together, vector_of
+from fdtasil.rollouts.wanted import Environment
 
 __all__ = ["EnvironmentLike", "EnvironmentPool", "resolve_horizon", "simulator_warnings"]
 
-EnvironmentLike = str | gymnasium.Env | Callable[[], gymnasium.Env]
+EnvironmentLike = (
+    str | gymnasium.Env | gymnasium.vector.VectorEnv | Callable[[], Any] | Environment
+)
+"""An id, an environment, one of many that step together (stable-baselines3's too), a function
+that makes one of them, or an id with what it is made with."""
 
 
 @dataclass(frozen=True)
 class Boxes:
-    """The continuous spaces of an environment.
+    """The spaces of an environment, flat.
 
     Attributes:
         observation_size: n, the length of an observation.
@@ -83,19 +91,23 @@ class EnvironmentPool:
 
     Args:
         environment: A gymnasium id (`module:Id` imports the module first), a gymnasium
-            environment, or a function without arguments that makes one. An environment that is
-            passed in is used as it is, one episode at a time, and is not closed.
+            environment, a vector environment (gymnasium's or stable-baselines3's), a function
+            without arguments that makes one, or an `Environment`. An environment that is passed
+            in is used as it is, and is not closed.
 
     Attributes:
         name: What messages call it.
         time_limit: Steps after which it ends an episode itself, or None.
-        boxes: Its spaces.
+        spaces: Its spaces.
+        boxes: The same, flat.
         bounds: Of its actions, in its own dtype.
+        together: The environment, where it is a vector environment; else None.
+        options: Given to each reset, or None.
         independent: Whether its copies are known not to disturb each other.
         trials: What it did when it was tried, by seed; see `trials.py`.
 
     Raises:
-        EnvironmentFault: If it can't be made, or its spaces are not flat continuous boxes.
+        EnvironmentFault: If it can't be made, or its spaces have no flat form.
 
     Example:
         >>> with EnvironmentPool("Pendulum-v1") as pool:
@@ -104,29 +116,42 @@ class EnvironmentPool:
     """
 
     def __init__(self, environment: EnvironmentLike) -> None:
-        self._owned = not isinstance(environment, gymnasium.Env)
+        wanted = environment if isinstance(environment, Environment) else Environment(environment)
+        self.options, given = wanted.reset_options, wanted.environment
+        self._owned = isinstance(given, str) or (
+            callable(given) and not isinstance(given, gymnasium.Env)
+        )
         self._single = False
         self._advice = (
             "try gymnasium.make(...) on its own; ids of other packages are 'module:Id'"
-            if isinstance(environment, str)
+            if isinstance(given, str)
             else "call it on its own; an expert comes before the environment"
         )
-        self._make = _factory(environment)
-        first = self._new()
-        self._members = [first]
+        self._make = wanted.factory()
+        self._members: list[gymnasium.Env] = []
         self._kept: list[gymnasium.Env] = []  # only to be closed
         self.independent = False
         self.trials: dict[int, Any] = {}
-        self.name = first.spec.id if first.spec else type(first.unwrapped).__name__
-        self.time_limit = _time_limit(first)
-        self.boxes, self.bounds = _read_boxes(first, self.name)
+        first = self._new()
+        self.together: Together | None = vector_of(first)
+        if self.together is None:
+            env = self._checked(first)
+            self.name = env.spec.id if env.spec else type(env.unwrapped).__name__
+            self.time_limit = _time_limit(env)
+            self.spaces = _spaces_of(env, self.name)
+            self._members = [self._flat(env)]
+            self.boxes, self.bounds = _read_boxes(self._members[0], self.name)
+        else:
+            self.name, self.time_limit = self.together.name, self.together.time_limit
+            self.spaces = _spaces_of(self.together, self.name)
+            self.boxes, self.bounds = _read_boxes(self.together, self.name, self.spaces)
 
     def take(self, count: int) -> list[gymnasium.Env]:
         """Return up to `count` copies; fewer where only one exists."""
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the first copy has said it all
             while self._owned and not self._single and len(self._members) < count:
-                made = self._new()
+                made = self._flat(self._checked(self._new()))
                 if any(made.unwrapped is member.unwrapped for member in self._members):
                     self._owned = False  # a factory that hands out one and the same
                     break
@@ -135,8 +160,14 @@ class EnvironmentPool:
 
     def wrap(self, wrapper: Callable[[gymnasium.Env], gymnasium.Env]) -> None:
         """Put a wrapper around every copy, those that are made later too."""
-        make = self._make
-        self._make = lambda: wrapper(make())
+        if self.together is not None:
+            raise EnvironmentFault(
+                f"{self.name} is a vector environment, and a memory or a history is kept",
+                "one environment, or a function that makes one",
+                'write for example env="Ant-v5"; copies of it are played side by side',
+            )
+        before = self._flat
+        self._flat = lambda made: wrapper(before(made))
         self._members = [wrapper(member) for member in self._members]
         self.boxes, self.bounds = _read_boxes(self._members[0], self.name)
 
@@ -148,7 +179,8 @@ class EnvironmentPool:
 
     def close(self) -> None:
         """Close the copies that the pool made; what can't be closed is warned of."""
-        for member in [*self._members, *self._kept] if self._owned else []:
+        together = [] if self.together is None else [self.together]
+        for member in [*self._members, *self._kept, *together] if self._owned else []:
             try:
                 member.close()
             except Exception as error:  # of the user's; what was done in it is not lost for that
@@ -166,23 +198,31 @@ class EnvironmentPool:
     ) -> None:
         self.close()
 
-    def _new(self) -> gymnasium.Env:
+    def _new(self) -> Any:
         try:
             with simulator_warnings():
-                made = self._make()
+                return self._make()
+        except EnvironmentFault:
+            raise
         except Exception as error:  # a factory is the caller's code and may raise anything
             raise EnvironmentFault(
                 f"the environment can't be made: {first_line(error)}",
                 "a gymnasium id, an environment, or a function without arguments that makes one",
                 self._advice,
             ) from error
-        if not isinstance(made, gymnasium.Env):
-            raise EnvironmentFault(
-                f"the environment factory returned {type(made).__name__}",
-                "a gymnasium.Env (one, not a vector environment)",
-                "return gymnasium.make(...) from it",
-            )
-        return made
+
+    def _checked(self, made: object) -> gymnasium.Env:
+        if isinstance(made, gymnasium.Env):
+            return made
+        raise EnvironmentFault(
+            f"the environment factory returned {type(made).__name__}",
+            "a gymnasium.Env, or a vector environment of gymnasium or stable-baselines3",
+            "return gymnasium.make(...) from it",
+        )
+
+    def _flat(self, made: gymnasium.Env) -> gymnasium.Env:  # pyright: ignore[reportRedeclaration]
+        """Return a copy with flat spaces, and with what `wrap` puts around it."""
+        return made if self.spaces.plain else Flat(made, self.spaces)
 
 
 def resolve_horizon(horizon: int | None, pool: EnvironmentPool) -> int:
@@ -231,20 +271,6 @@ def simulator_warnings() -> Iterator[None]:
             warn(f"MuJoCo: {message}")
 
 
-def _factory(environment: EnvironmentLike) -> Callable[[], gymnasium.Env]:
-    if isinstance(environment, gymnasium.Env):
-        return lambda: environment
-    if isinstance(environment, str):
-        return lambda: gymnasium.make(environment)
-    if callable(environment):
-        return environment
-    raise EnvironmentFault(
-        f"env is a {type(environment).__name__}",
-        "a gymnasium id, an environment, or a function that makes one",
-        'write for example env="HalfCheetah-v5"',
-    )
-
-
 def _time_limit(environment: gymnasium.Env) -> int | None:
     """Return the least number of steps after which the environment itself cuts an episode."""
     limits = [environment.spec.max_episode_steps] if environment.spec else []
@@ -256,10 +282,34 @@ def _time_limit(environment: gymnasium.Env) -> int | None:
     return min((limit for limit in limits if limit), default=None)
 
 
-def _read_boxes(environment: gymnasium.Env, name: str) -> tuple[Boxes, OwnBounds]:
-    observation = _flat_box(environment.observation_space, name, "observations")
-    action = _flat_box(environment.action_space, name, "actions")
-    own = OwnBounds(_unbounded(action.low), _unbounded(action.high))
+def _spaces_of(environment: gymnasium.Env | Together, name: str) -> Spaces:
+    try:
+        return Spaces(
+            layout_of(environment.observation_space, "observations"),
+            layout_of(environment.action_space, "actions"),
+        )
+    except UnknownSpace as unknown:
+        raise EnvironmentFault(
+            f"{name} has {unknown}",
+            "a Box, Discrete, MultiDiscrete or MultiBinary space, or a Dict or Tuple of them "
+            "(of actions, boxes of floats)",
+            "choose or wrap the environment so",
+        ) from None
+
+
+def _read_boxes(
+    environment: gymnasium.Env | Together, name: str, spaces: Spaces | None = None
+) -> tuple[Boxes, OwnBounds]:
+    """Return the flat spaces of an environment that has such, or whose layouts are given."""
+    if spaces is None:
+        seen, acted = (
+            layout_of(space, "")
+            for space in (environment.observation_space, environment.action_space)
+        )
+    else:
+        seen, acted = spaces.observations, spaces.actions
+    ends = _action_bounds(environment, acted)
+    own = OwnBounds(*map(_unbounded, ends))
     low, high = _rounded(own.low, np.inf), _rounded(own.high, -np.inf)
     if not (low < high).all():
         first = int((~(low < high)).argmax())
@@ -268,9 +318,26 @@ def _read_boxes(environment: gymnasium.Env, name: str) -> tuple[Boxes, OwnBounds
             "lower bounds below upper bounds",
             "drop the fixed actions with a gymnasium.ActionWrapper",
         )
-    n, wide = int(observation.shape[0]), np.float64
-    seen = _unbounded(observation.low.astype(wide)), _unbounded(observation.high.astype(wide))
-    return Boxes(n, low, high, *seen), own
+    wide = (
+        _unbounded(bound.astype(np.float64))
+        for bound in bounds_of(environment.observation_space, seen)
+    )
+    return Boxes(seen.size, low, high, *wide), own
+
+
+def _action_bounds(
+    environment: gymnasium.Env | Together, layout: Layout
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return the bounds of actions; those that ClipAction hides are the ones it clips to."""
+    layer = environment
+    while isinstance(layer, gymnasium.Wrapper):
+        clips = isinstance(layer, gymnasium.wrappers.ClipAction)
+        if not clips and layer.action_space != layer.env.action_space:
+            break
+        layer = layer.env
+        if clips:
+            return bounds_of(layer.action_space, layout)
+    return bounds_of(environment.action_space, layout)
 
 
 def _unbounded(bound: np.ndarray) -> np.ndarray:
@@ -284,20 +351,3 @@ def _rounded(bound: np.ndarray, inwards: float) -> np.ndarray:
     near = bound.astype(np.float32)
     beyond = near < bound if inwards > 0 else near > bound
     return np.where(beyond, np.nextafter(near, np.float32(inwards)), near)
-
-
-def _flat_box(space: gymnasium.Space, name: str, role: str) -> gymnasium.spaces.Box:
-    wrapper = "FlattenObservation"
-    if isinstance(space, gymnasium.spaces.Box) and len(space.shape) == 1 and space.shape[0] > 0:
-        if np.issubdtype(space.dtype, np.floating):
-            return space
-        wrapper = "DtypeObservation(env, np.float32)"
-    advice = {
-        "observations": f"wrap the environment in gymnasium.wrappers.{wrapper}",
-        "actions": "fdtasil distils continuous controllers; choose or wrap the environment so",
-    }
-    raise EnvironmentFault(
-        f"{name} has {role} {space}",
-        "a Box of floats with one dimension, of length 1 or more",
-        advice[role],
-    )

@@ -1,8 +1,8 @@
 """Episodes while they are recorded: every answer of an environment is looked at here."""
 
 import copy
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from numbers import Real
 from types import NoneType
 from typing import Any
@@ -15,6 +15,7 @@ from fdtasil.rollouts.behaviours import Decision, silent_rows
 from fdtasil.rollouts.environments import EnvironmentPool
 from fdtasil.rollouts.episodes import Episodes
 from fdtasil.rollouts.narrowing import Narrowing
+from fdtasil.rollouts.spaces import Mismatch
 
 __all__ = ["HOLD", "Recording"]
 
@@ -33,7 +34,7 @@ class Recording:
 
     def __init__(self, seeds: Sequence[int], horizon: int, pool: EnvironmentPool) -> None:
         n, m = pool.boxes.observation_size, pool.boxes.action_size
-        self._bounds, self._name = pool.bounds, pool.name
+        self._bounds, self._name, self.options = pool.bounds, pool.name, pool.options
         self._seeds, episodes = [int(seed) for seed in seeds], len(seeds)
         self.observations = np.zeros((episodes, horizon, n), np.float32)
         self.actions = np.zeros((episodes, horizon, m), np.float32)
@@ -55,7 +56,9 @@ class Recording:
     def reset(self, environment: gymnasium.Env, episode: int) -> np.ndarray:
         """Return the first observation of an episode."""
         try:
-            answer = environment.reset(seed=self._seeds[episode])
+            answer = environment.reset(seed=self._seeds[episode], **self._given)
+        except Mismatch as mismatch:
+            raise self._promised(episode, None, mismatch) from None
         except Exception as error:
             advice = _reset_advice(error)
             raise self._crash(episode, None, "reset()", error, advice) from error
@@ -79,6 +82,8 @@ class Recording:
         before = _clock(data)
         try:
             answer = environment.step(action)
+        except Mismatch as mismatch:
+            raise self._promised(episode, step, mismatch) from None
         except Exception as error:
             raise self._crash(episode, step, "step()", error) from error
         try:
@@ -100,6 +105,27 @@ class Recording:
             self.physics_resets[episode] += 1
         return _own(observation), going
 
+    def seed(self, episode: int) -> int:
+        """Return the reset seed of an episode."""
+        return self._seeds[episode]
+
+    @contextmanager
+    def blames(self, episode: int, step: int | None, call: str) -> Iterator[None]:
+        """Turn what is raised inside into an error that says in which episode."""
+        try:
+            yield
+        except Mismatch as mismatch:
+            raise self._promised(episode, step, mismatch) from None
+        except Exception as error:
+            raise self._crash(episode, step, call, error) from error
+
+    def note(
+        self, alive: Sequence[int], step: int, rewards: np.ndarray, terminated: np.ndarray
+    ) -> None:
+        """Record a step's (B,) rewards and ends of episodes that step together."""
+        self.rewards[alive, step] = rewards
+        self.terminated[alive] = terminated
+
     def check_rewards(self, alive: Sequence[int], step: int) -> None:
         """Raise where a reward is not finite: it would make every mean so."""
         rewards = self.rewards[alive, step]
@@ -108,7 +134,10 @@ class Recording:
             raise self._fault(alive[row], step, f"the reward is {rewards[row]}", "a finite number")
 
     def observed(
-        self, observations: Sequence[np.ndarray], alive: Sequence[int], step: int | None
+        self,
+        observations: Sequence[np.ndarray] | np.ndarray,
+        alive: Sequence[int],
+        step: int | None,
     ) -> np.ndarray:
         """Return observations as one float32 array; looked at together, for it is quicker so.
 
@@ -120,7 +149,8 @@ class Recording:
         size = self.observations.shape[2]
         try:
             # numpy would drop the masks of masked arrays.
-            whole = not any(map(np.ma.is_masked, observations))
+            one = type(observations) is np.ndarray  # one array is looked at as a whole
+            whole = one or not any(map(np.ma.is_masked, observations))
             batch = np.array(observations) if whole else np.empty(0)
         except ValueError:  # of several lengths
             batch = np.empty(0)
@@ -216,6 +246,14 @@ class Recording:
     def _where(self, episode: int, step: int | None) -> str:
         when = "" if step is None else f", step {step}"
         return f"{self._name}, episode {episode} (seed {self._seeds[episode]}){when}"
+
+    @property
+    def _given(self) -> dict[str, Any]:
+        return {} if self.options is None else {"options": copy.deepcopy(self.options)}
+
+    def _promised(self, episode: int, step: int | None, mismatch: Mismatch) -> EnvironmentFault:
+        found = f"an observation with {mismatch}"
+        return self._fault(episode, step, found, "what its observation_space promises")
 
     def _fault(
         self, episode: int, step: int | None, problem: str, expected: str

@@ -9,7 +9,7 @@ from fdtasil.rollouts.environments import EnvironmentPool, simulator_warnings
 from fdtasil.rollouts.episodes import Episodes
 from fdtasil.rollouts.recording import Recording
 from fdtasil.rollouts.stepping import step_together
-from fdtasil.rollouts.trials import independent_copies
+from fdtasil.rollouts.trials import stages_of
 
 __all__ = ["first_observations", "rollout"]
 
@@ -47,17 +47,15 @@ def rollout(
     record = Recording(seeds, horizon, pool)
     generators = list(noise) if noise is not None else [np.random.default_rng(s) for s in seeds]
     with simulator_warnings():
-        members = independent_copies(pool, min(len(seeds), _SLOTS))
-        for first in range(0, len(seeds), len(members)):
-            chunk = range(first, min(first + len(members), len(seeds)))
-            environments = dict(zip(chunk, members, strict=False))
-            step_together(record, environments, behaviour, generators, horizon, on_step)
+        stages = stages_of(pool, record, min(len(seeds), _SLOTS))
+        for playing in stages(range(len(seeds))):
+            step_together(record, playing, behaviour, generators, horizon, on_step)
     return record.episodes()
 
 
 def first_observations(pool: EnvironmentPool, seeds: Sequence[int]) -> np.ndarray:
     """Return the (E, n) float32 observations that episodes of these seeds start from."""
-    (environment,) = pool.take(1)
-    record, numbers = Recording(seeds, 0, pool), range(len(seeds))
+    record = Recording(seeds, 0, pool)
     with simulator_warnings():
-        return record.observed([record.reset(environment, e) for e in numbers], numbers, None)
+        stages = stages_of(pool, record, 1)
+        return np.concatenate([playing.begin() for playing in stages(range(len(seeds)))])

@@ -1,11 +1,11 @@
 """Episodes side by side, step by step: one batch of decisions for all that still go on."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 
-import gymnasium
 import numpy as np
 
 from fdtasil.rollouts.behaviours import Behaviour, Decision
+from fdtasil.rollouts.playing import Playing
 from fdtasil.rollouts.recording import Recording
 
 __all__ = ["step_together"]
@@ -13,7 +13,7 @@ __all__ = ["step_together"]
 
 def step_together(
     record: Recording,
-    environments: Mapping[int, gymnasium.Env],
+    playing: Playing,
     behaviour: Behaviour,
     noise: Sequence[np.random.Generator],
     horizon: int,
@@ -23,14 +23,14 @@ def step_together(
 
     Args:
         record: Where they are recorded.
-        environments: Number of an episode -> the environment that it is played in.
+        playing: Where they are played.
         behaviour: Who acts.
         noise: Generators handed to it, by the number of the episode.
         horizon: T, steps after which an episode is cut.
         on_step: Told the number of environment steps just done.
     """
-    alive = list(environments)
-    batch = record.observed([record.reset(environments[e], e) for e in alive], alive, None)
+    alive = playing.episodes
+    batch = playing.begin()
     for step in range(horizon):
         decision = behaviour(batch, [noise[e] for e in alive])
         if decision.silent is not None:
@@ -41,15 +41,12 @@ def step_together(
             if not alive:
                 break
         allowed = record.decide(alive, step, batch, decision)
-        after, going = [], np.ones(len(alive), bool)
-        for row, episode in enumerate(alive):
-            observation, going[row] = record.step(
-                environments[episode], allowed[row], episode, step
-            )
-            after.append(observation)
+        after, going = playing.step(alive, allowed, step)
         on_step(len(alive))
-        record.check_rewards(alive, step)
-        batch = record.observed(after, alive, step)[going]
+        if going.all():
+            batch = after
+            continue
+        batch = after[going]
         alive = [episode for row, episode in enumerate(alive) if going[row]]
         if not alive:
             break

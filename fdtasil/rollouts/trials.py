@@ -1,6 +1,6 @@
 """A few steps with drawn actions: whether an environment does twice what it did once."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
@@ -11,6 +11,7 @@ import numpy as np
 from fdtasil.errors import EnvironmentFault, FdtasilError, warn
 from fdtasil.rollouts.behaviours import random_behaviour
 from fdtasil.rollouts.environments import EnvironmentPool, simulator_warnings
+from fdtasil.rollouts.playing import InTurn, Playing, SideBySide
 from fdtasil.rollouts.recording import Recording
 from fdtasil.rollouts.stepping import step_together
 
@@ -19,8 +20,8 @@ __all__ = [
     "check_repeats",
     "differ",
     "fingerprint",
-    "independent_copies",
     "other_environment",
+    "stages_of",
 ]
 
 _STEPS = 3  # a wrapper that remembers shows it at the first, a simulator that is shared as well
@@ -91,8 +92,8 @@ def check_repeats(pool: EnvironmentPool, seed: int, *, force: bool = False) -> N
                 "differ in their last digits"
             )
         return
-    layer = _culprit(pool, seed)
-    if not _remembers(pool, layer, first, seed):
+    layer = None if pool.together is not None else _culprit(pool, seed)
+    if layer is None or not _remembers(pool, layer, first, seed):
         warn(
             f"{pool.name} does not give the same {what} twice with one seed, so equal "
             "runs differ, and expert and student are not compared from the same starts: seed it "
@@ -170,7 +171,32 @@ def _some(values: Any) -> str:
     return f"[{', '.join(map(str, listed[:4]))}{', ...' * (len(listed) > 4)}]"
 
 
-def independent_copies(pool: EnvironmentPool, count: int) -> list[gymnasium.Env]:
+def stages_of(
+    pool: EnvironmentPool, record: Recording, count: int
+) -> Callable[[Sequence[int]], Iterator[Playing]]:
+    """Return what plays episodes in a pool, some at a time.
+
+    Args:
+        pool: The environment.
+        record: Where they are recorded.
+        count: How many copies of it are made, where it does not step together.
+    """
+    together = pool.together
+    members = [] if together is not None else _independent_copies(pool, count)
+    size = len(members) if together is None else together.count
+
+    def stages(episodes: Sequence[int]) -> Iterator[Playing]:
+        for first in range(0, len(episodes), size):
+            chunk = episodes[first : first + size]
+            if together is not None:
+                yield SideBySide(record, together, pool.spaces, chunk)
+            else:
+                yield InTurn(record, dict(zip(chunk, members, strict=False)))
+
+    return stages
+
+
+def _independent_copies(pool: EnvironmentPool, count: int) -> list[gymnasium.Env]:
     """Return up to `count` copies that don't disturb each other; one where they do."""
     members = pool.take(count)
     if len(members) == 1 or pool.independent:
@@ -192,18 +218,24 @@ def independent_copies(pool: EnvironmentPool, count: int) -> list[gymnasium.Env]
 def _tried(pool: EnvironmentPool, seed: int) -> tuple[Trial, Trial]:
     """Return two trials of one seed; the same two, whenever they are asked for."""
     if seed not in pool.trials:
-        (member,) = pool.take(1)
-        pool.trials[seed] = _trial(pool, [member], seed), _trial(pool, [member], seed)
+        pool.trials[seed] = _trial(pool, None, seed), _trial(pool, None, seed)
     return pool.trials[seed]
 
 
-def _trial(pool: EnvironmentPool, environments: Sequence[gymnasium.Env], seed: int = 0) -> Trial:
-    """Play in the first environment, with the others beside it."""
-    seeds = range(seed, seed + len(environments))
+def _trial(
+    pool: EnvironmentPool, environments: Sequence[gymnasium.Env] | None, seed: int = 0
+) -> Trial:
+    """Play in the first environment, with the others beside it; in the pool's own for None."""
+    seeds = range(seed, seed + len(environments or (0,)))
     record, noise = Recording(seeds, _STEPS, pool), [np.random.default_rng(s) for s in seeds]
+    if environments is not None:
+        playing: Playing = InTurn(record, dict(enumerate(environments)))
+    elif pool.together is not None:
+        playing = SideBySide(record, pool.together, pool.spaces, range(1))
+    else:
+        playing = InTurn(record, dict(enumerate(pool.take(1))))
     with simulator_warnings():
-        numbered = dict(enumerate(environments))
-        step_together(record, numbered, random_behaviour(pool), noise, _STEPS)
+        step_together(record, playing, random_behaviour(pool), noise, _STEPS)
     valid = record.valid[0]
     return Trial(record.observations[0, valid], record.rewards[0, valid, None])
 

@@ -4,7 +4,12 @@ from dataclasses import dataclass, replace
 
 from fdtasil.checks import check_choice, check_count, spelt
 from fdtasil.demonstrations.dataset import Dataset
-from fdtasil.demonstrations.trainers import BehaviourCloning, Trainer, trainer_of
+from fdtasil.demonstrations.trainers import (
+    BehaviourCloning,
+    Trainer,
+    check_choices,
+    trainer_of,
+)
 from fdtasil.errors import SettingError
 from fdtasil.experts.cost import CHEAP, multiply_adds
 from fdtasil.experts.expert import Expert
@@ -81,6 +86,8 @@ class Arguments:
             SettingError: If the environment allows no such horizon.
             EnvironmentFault: If it fails in its first steps.
         """
+        if subject.spaces and subject.spaces.actions.choices and self.trainer is not None:
+            check_choices(self.trainer)
         usual = self._usual(subject)
         if self.anew is None or subject.expert is None:
             return usual
@@ -134,6 +141,7 @@ class Arguments:
             spread=self._spread(subject),
             fingerprint=fingerprint(subject.pool, start) if subject.pool else None,
             reason=None,
+            spaces=subject.spaces,
         )
 
     def _spread(self, subject: Subject) -> Spread:

@@ -81,7 +81,8 @@ class Collecting:
         counts["terminated_episodes"] += int(episodes.terminated.sum())
         counts["replaced_episodes"] += replaced
         counts["given_up_episodes"] += int(episodes.given_up.sum())
-        dataset = Dataset(states, None, None, boxes.low, boxes.high, self.pool.name)
+        spaces = None if self.pool.spaces.plain else self.pool.spaces
+        dataset = Dataset(states, None, None, boxes.low, boxes.high, self.pool.name, spaces)
         return Collected(dataset, first + len(episodes.valid), counts)
 
     def check_kept(self, kept: Collected) -> None:
@@ -120,7 +121,8 @@ class Collecting:
 
         boxes = self.pool.boxes
         half = np.where(boxes.bounded, (boxes.high - boxes.low) / 2, np.float32(1))
-        situation = Situation(round_, self.expert, half, student, record_extra)
+        chooses = bool(self.pool.spaces.actions.choices)
+        situation = Situation(round_, self.expert, half, student, record_extra, chooses)
         return self.trainer.behaviour(situation)
 
     def _episodes(self, behaviour: Behaviour, stream: str, first: int, count: int) -> Episodes:

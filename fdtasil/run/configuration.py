@@ -13,6 +13,7 @@ from fdtasil.probes.calibration import Ladder, ladder_for
 from fdtasil.probes.derivatives import comparison_rows
 from fdtasil.probes.source import Probes
 from fdtasil.probes.spread import Spread
+from fdtasil.rollouts.spaces import Spaces
 from fdtasil.rollouts.survivors import ATTEMPTS, SURVIVORS
 from fdtasil.student.architectures import Architecture, describe
 from fdtasil.student.fit import Fit
@@ -87,12 +88,14 @@ class Configuration:
     past: int = 0
     remembered: int = 0
     own_derivatives: bool = False
+    spaces: Spaces | None = None
 
     @property
-    def held(self) -> range:
-        """The coordinates that the student sees and probes do not move: the past."""
+    def held(self) -> tuple[int, ...]:
+        """The coordinates that the student sees and probes do not move: choices, the past."""
         stop = self.observation_size - self.remembered
-        return range(stop - self.past, stop)
+        still = self.spaces.observations.held if self.spaces else ()
+        return (*still, *range(stop - self.past, stop))
 
     def predicted_queries(self) -> dict[str, int]:
         """Return the rows that the run will ask the expert for, by purpose.
@@ -216,6 +219,7 @@ class Configuration:
             "probes": self.probes.describe() if self.probes else "none",
             "student": describe(self.student),
             "spread": self.spread.to_json(),
+            "spaces": self.spaces.to_json() if self.spaces else None,
             "fit": self.fit.to_json(anew=self.probes is not None and self.probes.resample),
         }
         whole = {name: written.get(name, value) for name, value in vars(self).items()}

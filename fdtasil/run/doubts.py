@@ -30,7 +30,7 @@ def warn_of_falls(states: Demonstrations, expert: Episodes, keep: str) -> None:
     """
     lasts, horizon = 1 - float(expert.terminated.mean()), expert.valid.shape[1]
     episodes, lengths = np.unique(states.episode, return_counts=True)
-    fallen = lengths[np.isin(episodes, states.episode[states.terminated])]
+    fallen = lengths[np.isin(episodes, states.episode[states.terminated]) & (lengths < horizon)]
     if len(fallen) and len(episodes) <= _FEW and lasts >= _USUALLY and keep != SURVIVORS:
         warn(
             f"{len(fallen)} of {len(episodes)} demonstrations ended early, after "

@@ -1,5 +1,6 @@
 """What a round learns from, with what is computed of it once."""
 
+from collections.abc import Collection
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -7,6 +8,7 @@ import numpy as np
 from fdtasil.demonstrations.dataset import Dataset
 from fdtasil.probes.scales import Scales, measure_scales
 from fdtasil.probes.spread import Spread
+from fdtasil.rollouts.spaces import Spaces, flat_layout
 from fdtasil.run.checkpoints import Collected
 from fdtasil.student.view import StudentObservation, View
 
@@ -34,7 +36,7 @@ class Lesson:
         student_obs: StudentObservation | None,
         before: "Lesson | None",
         spread: Spread,
-        held: range,
+        held: Collection[int],
     ) -> "Lesson":
         """Return the lesson of what is collected.
 
@@ -52,7 +54,8 @@ class Lesson:
         first = states.observations[states.round == 0][:256]
         view = View.of(student_obs, first) if before is None else before.view
         if held:
-            view = replace(view, seen=view.seen & ~np.isin(np.arange(len(view.seen)), held))
+            moved = ~np.isin(np.arange(len(view.seen)), list(held))
+            view = replace(view, seen=view.seen & moved)
         scales = measure_scales(states.observations, view.seen)
         told = spread.among(states.observations, states.episode)
         return cls(collected, view, scales.spread_by(told))
@@ -70,6 +73,35 @@ class Lesson:
             if self.scales.told[column]
         }
         return own.spread_by(told)
+
+    def spaces_of_student(self, past: int) -> Spaces | None:
+        """Return the spaces of what the student sees and does, where they are no plain boxes."""
+        spaces = self.dataset.spaces
+        if spaces is None:
+            return None
+        observations = spaces.observations
+        if past or not self.view.is_whole:
+            columns = None if past else self.view.columns
+            size = self.view.size
+            observations = flat_layout(size) if columns is None else observations.seen(columns)
+        return Spaces(observations, spaces.actions)
+
+    @property
+    def action_scales(self) -> Scales | None:
+        """How far actions without bounds go; one scale for all scores of a choice.
+
+        None where all have bounds, which say it.
+        """
+        dataset = self.dataset
+        if (np.isfinite(dataset.low) & np.isfinite(dataset.high)).all():
+            return None
+        actions = dataset.demonstrations.actions
+        own = measure_scales(actions)
+        mean, scale = own.mean.copy(), own.scale.copy()
+        for start, end in dataset.spaces.actions.choices if dataset.spaces else ():
+            size = float(np.sqrt(np.square(actions[:, start:end], dtype=np.float64).mean()))
+            mean[start:end], scale[start:end] = 0.0, size or 1.0
+        return replace(own, mean=mean, scale=scale)
 
     @property
     def dataset(self) -> Dataset:

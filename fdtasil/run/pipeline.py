@@ -15,8 +15,9 @@ from fdtasil.experts.carrying import carry
 from fdtasil.experts.examination import check_first, examine
 from fdtasil.experts.expert import Expert, Hints
 from fdtasil.experts.gate import GATE_STATES, compare_again, large_batch
-from fdtasil.experts.load import ExpertLike, load_expert, open_expert, sized
+from fdtasil.experts.load import ExpertLike, expert_in, open_expert, sized
 from fdtasil.experts.silence import Silence
+from fdtasil.experts.structure import in_spaces
 from fdtasil.probes.source import Probes
 from fdtasil.probes.spread import SpreadLike
 from fdtasil.progress import Progress
@@ -26,6 +27,7 @@ from fdtasil.rollouts.behaviours import follow, follow_answers
 from fdtasil.rollouts.environments import EnvironmentLike, EnvironmentPool, resolve_horizon
 from fdtasil.rollouts.episodes import Episodes
 from fdtasil.rollouts.history import past_size
+from fdtasil.rollouts.spaces import Spaces, flat_layout
 from fdtasil.run.account import Account
 from fdtasil.run.arguments import read_arguments
 from fdtasil.run.asking import Asking
@@ -39,7 +41,7 @@ from fdtasil.run.interrupts import heard_interrupts
 from fdtasil.run.lesson import Lesson
 from fdtasil.run.report import config_of, no_answer, report_of
 from fdtasil.run.rounds import Rounds
-from fdtasil.run.subject import Subject, open_subject, visible
+from fdtasil.run.subject import Subject, named, open_subject, visible
 from fdtasil.run.training import Training
 from fdtasil.seeding import episode_seeds
 from fdtasil.student.architectures import Architecture
@@ -88,8 +90,10 @@ def distill(
             stable-baselines3's `predict`, a function on batches (B, n) -> (B, m) in environment
             units, an address, or what `load_expert` made of one of them with options of its own.
             None with `dataset`: then nobody is asked.
-        env: A gymnasium id (`module:Id` too), a gymnasium environment, or a function making one.
-            None with `dataset`: then nothing is recorded or evaluated.
+        env: A gymnasium id (`module:Id` too), a gymnasium environment, a vector environment
+            (gymnasium's or stable-baselines3's), a function making one, or a
+            `fdtasil.Environment`, which says what it is made and reset with. None with `dataset`:
+            then nothing is recorded or evaluated.
         probes: The derivative source. Left out, what `dataset` holds, or "fresh" for files,
             modules and agents of few multiply-adds, and 10 for others. 0 (plain behaviour
             cloning), "fresh" (asked anew at every visit, near and far; the answers are labels),
@@ -108,8 +112,9 @@ def distill(
         seed: Equal seeds give equal bytes, on one machine with the same versions.
         student: The architecture of its network, `fdtasil.Mlp(hidden, activation)`. Left out, two
             hidden layers of 512, or of 256 where the expert is asked anew.
-        student_obs: Indices of the coordinates that the student sees, or a function
-            (B, n) -> (B, k); the expert sees all. Probes move only what the student sees.
+        student_obs: Indices of the coordinates that the student sees, names of parts of a
+            dictionary, or a function (B, n) -> (B, k); the expert sees all. Probes move only what
+            the student sees.
         history: How many observations the student sees, with the actions between them; more than
             one for an expert with a memory, or an environment that hides speeds. Probes move the
             present one. `fdtasil.History` keeps them where the student runs.
@@ -189,6 +194,8 @@ def distill(
     chosen, told = pick_device(arguments.device), tell_all(callback)
     with heard_warnings() as notes, open_subject(expert, env, given, history) as subject:
         going_on = asked_anew(folder) if folder is not None and resume is not None else None
+        layout = subject.spaces.observations if subject.spaces else None
+        student_obs = named(student_obs, layout)
         student_obs = visible(student_obs, subject.observation_size, subject.remembered)
         arguments = replace(arguments, student_obs=student_obs)
         run, bars = arguments.configure(subject, going_on), Progress(progress)
@@ -264,9 +271,10 @@ def evaluate(
     count, bars = check_count("episodes", episodes), Progress(check_flag("progress", progress))
     with EnvironmentPool(env) as pool, torch_settings(torch.device("cpu")):
         n, m = pool.boxes.observation_size, pool.boxes.action_size
-        black_box, length = load_expert(expert, n, m), resolve_horizon(horizon, pool)
+        black_box, length = expert_in(expert, pool), resolve_horizon(horizon, pool)
+        student_obs = named(student_obs, pool.spaces.observations)
         seen_size = view_size(student_obs, n + past_size(history, n, m))
-        judged = open_expert(policy, Hints(seen_size, m))
+        judged = _judged(policy, pool, seen_size, whole=student_obs is None and history == 1)
         if judged.memory is not None:
             raise SettingError(
                 f"{judged.name}, which has a memory, to be judged",
@@ -285,6 +293,15 @@ def evaluate(
         acting = follow_answers(answer)
         own = n - past - remembered
         return evaluate_pair(acting, black_box, theirs, pool, length, seed, bars, limits, own)
+
+
+def _judged(policy: ExpertLike, pool: EnvironmentPool, size: int | None, *, whole: bool) -> Expert:
+    """Open a policy that is judged; one that sees a part of the observation takes flat rows."""
+    spaces = None if pool.spaces.plain else pool.spaces
+    judged = open_expert(policy, Hints(size, pool.boxes.action_size, spaces=spaces))
+    if spaces is not None and (not whole or judged.columns is not None):
+        spaces = Spaces(flat_layout(size or 1), spaces.actions)
+    return in_spaces(judged, spaces)
 
 
 def check_history(history: object, student_obs: object) -> int:

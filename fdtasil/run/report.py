@@ -35,6 +35,12 @@ def no_answer(account: Account) -> dict[str, float]:
     return {name: rows / asked[name] for name, rows in silent if rows > 0 and asked[name] > 0}
 
 
+def _held(run: Configuration) -> list[str]:
+    """Return the parts of the observation that no probe moves, by name."""
+    parts = run.spaces.observations.parts if run.spaces else ()
+    return [part.name or "observation" for part in parts if part.kind != "number"]
+
+
 def report_of(
     run: Configuration,
     evaluation: Evaluation | None,
@@ -90,6 +96,7 @@ def report_of(
         "rows_asked_again_after_resuming": account.again,
         "states": len(lesson.dataset.demonstrations),
         "frozen_coordinates": int((~lesson.scales.live).sum()),
+        "held": _held(run),
         **{name: lesson.collected.counts.get(name, 0) for name in counts},
         "steps": steps,
         "train_seconds": round(train_seconds, 2),

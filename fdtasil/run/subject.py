@@ -4,15 +4,18 @@ from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 
+from fdtasil.checks import spelt
 from fdtasil.demonstrations.dataset import Dataset
 from fdtasil.errors import SettingError
 from fdtasil.experts.carrying import carry
 from fdtasil.experts.expert import Expert
-from fdtasil.experts.load import ExpertLike, load_expert
+from fdtasil.experts.load import ExpertLike, expert_in, load_expert
+from fdtasil.experts.structure import in_spaces
 from fdtasil.rollouts.environments import EnvironmentLike, EnvironmentPool
+from fdtasil.rollouts.spaces import Layout, Spaces
 from fdtasil.student.view import StudentObservation, describe_view
 
-__all__ = ["Subject", "open_subject", "visible"]
+__all__ = ["Subject", "named", "open_subject", "visible"]
 
 
 @dataclass(frozen=True)
@@ -27,6 +30,7 @@ class Subject:
         action_size: m.
         past: Length of the past that the student sees.
         remembered: Length of the expert's memory; 0 where it has none.
+        spaces: Of the environment, where they are no plain boxes.
     """
 
     expert: Expert | None
@@ -36,6 +40,7 @@ class Subject:
     action_size: int
     past: int = 0
     remembered: int = 0
+    spaces: Spaces | None = None
 
     @property
     def comparable(self) -> bool:
@@ -71,9 +76,10 @@ def open_subject(
     with EnvironmentPool(env) if env is not None else nullcontext() as pool:
         if pool is not None:
             n, m, name = pool.boxes.observation_size, pool.boxes.action_size, pool.name
+            spaces = None if pool.spaces.plain else pool.spaces
         else:
             assert given is not None
-            n, m, name = *given.sizes, given.environment
+            n, m, name, spaces = *given.sizes, given.environment, given.spaces
         if given is not None and given.sizes != (n, m):
             raise SettingError(
                 f"a dataset with (observations, actions) of sizes {given.sizes}",
@@ -82,8 +88,36 @@ def open_subject(
             )
         opened, past, remembered = None, 0, 0
         if expert is not None:
-            opened, past, remembered = carry(load_expert(expert, n, m), pool, history)
-        yield Subject(opened, pool, name, n + past + remembered, m, past, remembered)
+            found = load_expert(expert, n, m) if pool is None else expert_in(expert, pool)
+            found = in_spaces(found, spaces)
+            opened, past, remembered = carry(found, pool, history)
+        size = n + past + remembered
+        yield Subject(opened, pool, name, size, m, past, remembered, spaces)
+
+
+def named(
+    student_obs: StudentObservation | None, observations: Layout | None
+) -> StudentObservation | None:
+    """Return the columns of parts that are said by their names; what else is said as it is.
+
+    Raises:
+        SettingError: If there is no such part.
+    """
+    names = (student_obs,) if isinstance(student_obs, str) else student_obs
+    if not isinstance(names, list | tuple) or not any(isinstance(one, str) for one in names):
+        return student_obs
+    known = observations.names if observations else ()
+    columns: list[int] = []
+    for name in names:
+        try:
+            columns += observations.columns(str(name)) if observations else {}[name]
+        except KeyError:
+            raise SettingError(
+                spelt("student_obs", student_obs),
+                f"names of parts of the observation: {', '.join(known) or 'it has none'}",
+                "write indices, or these names",
+            ) from None
+    return tuple(dict.fromkeys(columns))
 
 
 def visible(

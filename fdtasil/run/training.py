@@ -86,7 +86,16 @@ class Training:
     def _fresh(self, seen: Demonstrations, lesson: Lesson, round_: int) -> Student:
         scales, bounds = lesson.normaliser(seen.observations), lesson.dataset
         start = torch_generator(self.run.seed, "student", round_)
-        return Student(self.run.student, scales.mean, scales.scale, bounds.low, bounds.high, start)
+        return Student(
+            self.run.student,
+            scales.mean,
+            scales.scale,
+            bounds.low,
+            bounds.high,
+            start,
+            lesson.action_scales,
+            lesson.spaces_of_student(self.run.past),
+        )
 
     def _warn_of_one_episode(self, seen: Demonstrations, episodes: int) -> None:
         run = self.run

@@ -5,9 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
+from fdtasil.checks import check_choice
 from fdtasil.errors import ExportError, SettingError
 from fdtasil.files.onnx.export import check_finite, export_module
 from fdtasil.student.c_source import c_header, c_source, check_parity
+from fdtasil.student.own_form import own_form
 from fdtasil.student.plain import PlainPolicy
 from fdtasil.student.policy import Student
 
@@ -15,6 +17,22 @@ __all__ = ["EXPORTS", "export"]
 
 Writer = Callable[[Student, np.ndarray, Mapping[str, str]], bytes]
 """A student, (B, n) states of its training and metadata -> the bytes of a file."""
+
+
+def _onnx(
+    student: Student, states: np.ndarray, metadata: Mapping[str, str], *, keys: bool = False
+) -> bytes:
+    written = export_module(student, states, metadata)
+    if student.spaces is None and not keys:
+        return written
+    import onnx
+
+    model = own_form(onnx.load_from_string(written), student.spaces, keys=keys)
+    return model.SerializeToString(deterministic=True)
+
+
+def _onnx_with_keys(student: Student, states: np.ndarray, metadata: Mapping[str, str]) -> bytes:
+    return _onnx(student, states, metadata, keys=True)
 
 
 def _safetensors(student: Student, states: np.ndarray, metadata: Mapping[str, str]) -> bytes:
@@ -46,7 +64,7 @@ def _h(student: Student, states: np.ndarray, metadata: Mapping[str, str]) -> byt
 
 
 EXPORTS: dict[str, Writer] = {
-    ".onnx": export_module,
+    ".onnx": _onnx,
     ".safetensors": _safetensors,
     ".c": _c,
     ".h": _h,
@@ -55,7 +73,11 @@ EXPORTS: dict[str, Writer] = {
 
 
 def export(
-    student: Student, states: np.ndarray, metadata: Mapping[str, str], name: str | Path
+    student: Student,
+    states: np.ndarray,
+    metadata: Mapping[str, str],
+    name: str | Path,
+    inputs: str = "flat",
 ) -> bytes:
     """Return a student as the file that a name asks for.
 
@@ -64,9 +86,10 @@ def export(
         states: (B, n) states of its training, on which the file is compared with it.
         metadata: What the file says of itself.
         name: Ends with one of the suffixes of `EXPORTS`.
+        inputs: "flat", or "keys" for an ONNX file with one input for each part of an observation.
 
     Raises:
-        SettingError: If there is no such target.
+        SettingError: If there is no such target, or it has one input.
         ExportError: If the file's answers differ from the student's by more than 1e-5.
     """
     suffix = Path(name).suffix
@@ -76,4 +99,9 @@ def export(
             f"a name that ends with {' or '.join(EXPORTS)}",
             "write for example student.onnx",
         )
-    return EXPORTS[suffix](student, states, metadata)
+    if check_choice("inputs", inputs, ("flat", "keys")) == "flat":
+        return EXPORTS[suffix](student, states, metadata)
+    if suffix != ".onnx":
+        step = 'write a name that ends with .onnx, or inputs="flat"'
+        raise SettingError(f'{suffix} with inputs="keys"', "an ONNX file", step)
+    return _onnx_with_keys(student, states, metadata)

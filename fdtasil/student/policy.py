@@ -14,6 +14,7 @@ from fdtasil.files.border import reads
 from fdtasil.files.onnx.graph import Graph
 from fdtasil.files.tensors import tensors_from_bytes, tensors_to_bytes
 from fdtasil.probes.scales import Scales
+from fdtasil.rollouts.spaces import Mismatch, Spaces
 from fdtasil.student.architectures import Architecture, Mlp, architecture_of, describe
 from fdtasil.student.plain import PlainPolicy
 
@@ -36,7 +37,11 @@ class Student(nn.Module):
         high: (m,) upper bounds; where a bound is infinite the output is linear.
         random: Draws the initial weights.
         actions: Scales of the expert's actions, in which linear outputs are; None for ones.
+        spaces: Of what it sees and does, where they are no plain boxes: `predict` takes and
+            returns the environment's own form. Actions of a choice are its scores.
     """
+
+    takes_flat_rows = True  # when it is called, whatever `predict` takes
 
     mean: Tensor
     scale: Tensor
@@ -55,9 +60,10 @@ class Student(nn.Module):
         high: np.ndarray,
         random: torch.Generator,
         actions: Scales | None = None,
+        spaces: Spaces | None = None,
     ) -> None:
         super().__init__()
-        self.architecture = architecture
+        self.architecture, self.spaces = architecture, spaces
         for name, value in {"mean": mean, "scale": scale, "low": low, "high": high}.items():
             self.register_buffer(name, torch.from_numpy(np.array(value, np.float32)))
         self.network = architecture.build(len(mean), len(low), random)
@@ -152,17 +158,20 @@ class Student(nn.Module):
         """Answer as stable-baselines3's `predict` does.
 
         Args:
-            observation: (n,) or (B, n) raw observations.
+            observation: (n,) or (B, n) raw observations, or what the environment gives.
             state: Returned as it is; the student has no memory.
             episode_start: Not used.
             deterministic: Not used; the student always is.
 
         Returns:
-            (m,) or (B, m) float32 actions in environment units, and `state`.
+            (m,) or (B, m) float32 actions in environment units, or what the environment takes
+            (of a choice, which), and `state`.
 
         Raises:
             SettingError: If the observations have another shape.
         """
+        if self.spaces is not None:
+            return self._in_spaces(observation, self.spaces), state
         rows = np.asarray(observation, np.float32)
         n = self.observation_size
         if rows.ndim not in (1, 2) or rows.shape[-1] != n:
@@ -171,17 +180,33 @@ class Student(nn.Module):
                 f"({n},) or (B, {n})",
                 "pass raw observations",
             )
-        # Torch takes longer to begin than the numbers of one row take.
-        plain = self.plain if rows.ndim == 1 or len(rows) == 1 else None
-        if plain is not None:
-            return plain(rows), state
-        actions = self.act(np.atleast_2d(rows))
+        actions = self._answered(np.atleast_2d(rows))
         return (actions[0] if rows.ndim == 1 else actions), state
+
+    def _answered(self, rows: np.ndarray) -> np.ndarray:
+        # Torch takes longer to begin than the numbers of one row take.
+        plain = self.plain if len(rows) == 1 else None
+        return self.act(rows) if plain is None else plain(rows)
+
+    def _in_spaces(self, observation: Any, spaces: Spaces) -> Any:
+        try:
+            rows, one = spaces.observations.read(observation)
+        except Mismatch as mismatch:
+            names = ", ".join(spaces.observations.names)
+            raise SettingError(
+                f"an observation with {mismatch}",
+                f"what the environment gives{f': {names}' if names else ''}, or flat rows",
+                "pass raw observations",
+            ) from None
+        actions = self._answered(rows)
+        return spaces.actions.value(actions[0]) if one else spaces.actions.values(actions)
 
     def to_bytes(self, metadata: Mapping[str, str] | None = None) -> bytes:
         """Return the student as a safetensors file; equal students give equal bytes."""
         sizes = {"observation_size": self.observation_size, "action_size": self.action_size}
         about = {"student": {**sizes, **describe(self.architecture)}, **(metadata or {})}
+        if self.spaces is not None:
+            about["spaces"] = self.spaces.to_json()
         return tensors_to_bytes(self.state_dict(), about, _ENTRY)
 
     @classmethod
@@ -205,7 +230,10 @@ class Student(nn.Module):
             raise ValueError("a normaliser or bounds that are no vectors")
         _check_widths(fields, tensors, len(mean), len(low))
         architecture, random = architecture_of(fields), torch.Generator()
-        student = cls(architecture, mean, scale, low, high, random)
+        spaces = Spaces.from_json(about["spaces"]) if "spaces" in about else None
+        if spaces and (spaces.observations.size, spaces.actions.size) != (len(mean), len(low)):
+            raise ValueError("spaces of other sizes than the network")
+        student = cls(architecture, mean, scale, low, high, random, spaces=spaces)
         student.load_state_dict(tensors)
         return student.eval()
 

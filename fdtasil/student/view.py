@@ -16,8 +16,8 @@ from fdtasil.rollouts.behaviours import Policy
 
 __all__ = ["StudentObservation", "Unseen", "View", "describe_view", "view_size"]
 
-StudentObservation = Sequence[int] | Callable[[np.ndarray], np.ndarray]
-"""Indices of the coordinates that the student sees, or (B, n) -> (B, k)."""
+StudentObservation = Sequence[int] | Sequence[str] | Callable[[np.ndarray], np.ndarray]
+"""Indices of the coordinates that the student sees, names of parts, or (B, n) -> (B, k)."""
 
 _SAME = 1e-4  # relative; beyond the rounding of float32, below any nonlinearity worth the name
 

@@ -7,11 +7,24 @@ import numpy as np
 from numpy.typing import ArrayLike
 from torch import nn
 
-from fdtasil.errors import ExpertError, FdtasilError, SettingError
+from fdtasil.errors import ExpertError, FdtasilError, SettingError, shown
 from fdtasil.experts.sb3.archive import Archive, read_archive
-from fdtasil.experts.sb3.network import Clip, Normalise, Rescale, build_network
+from fdtasil.experts.sb3.network import (
+    Clip,
+    MeanOfQuantiles,
+    Normalise,
+    Rescale,
+    build_network,
+)
 from fdtasil.experts.sb3.recipes import Recipe, check_policy, find_recipe, read_activation
-from fdtasil.experts.sb3.spaces import Bounds, given_bounds, read_bounds, read_size
+from fdtasil.experts.sb3.spaces import (
+    Bounds,
+    choice_sizes,
+    given_bounds,
+    no_bounds,
+    read_bounds,
+    read_size,
+)
 from fdtasil.experts.sb3.statistics import VecNormalizePath, read_statistics
 from fdtasil.experts.sb3.trust import TRUST, Trust, check_trust
 from fdtasil.files.border import reads
@@ -19,17 +32,21 @@ from fdtasil.files.border import reads
 __all__ = ["Agent", "read_agent"]
 
 
+_MOST_QUANTILES = 10_000
+
+
 @dataclass(frozen=True)
 class Agent:
     """A trained agent of stable-baselines3.
 
     Attributes:
-        algorithm: "SAC", "TD3", "DDPG", "TQC", "PPO", "A2C" or "TRPO".
+        algorithm: "SAC", "TD3", "DDPG", "TQC", "PPO", "A2C", "TRPO", "DQN" or "QRDQN".
         observation_size: n.
-        action_low: (m,) float32, lower action bounds in environment units.
+        action_low: (m,) float32, lower action bounds in environment units; scores have none.
         action_high: (m,) float32, upper bounds.
         module: (B, n) float32 raw observations -> (B, m) float32 actions in environment units,
-            what `agent.predict(observations, deterministic=True)` returns.
+            what `agent.predict(observations, deterministic=True)` returns; of an agent that
+            chooses, the scores (logits or values), the best of which it takes.
         source: The zip.
         sha256: Of the zip.
         library_version: Version of stable-baselines3 that wrote it, or "unknown".
@@ -65,8 +82,8 @@ def read_agent(
     """Read an agent that stable-baselines3 saved, since its version 0.6, without unpickling.
 
     Args:
-        path: The zip of a SAC, TD3, DDPG, TQC, PPO, A2C or TRPO agent with an MLP policy; its
-            ".zip" may be left out, as in stable-baselines3.
+        path: The zip of a SAC, TD3, DDPG, TQC, PPO, A2C, TRPO, DQN or QR-DQN agent with an MLP
+            policy; its ".zip" may be left out, as in stable-baselines3.
         trust: "pickle" to have stable-baselines3 load what can't be read otherwise: gSDE, custom
             policies, feature extractors and activations, and the statistics of VecNormalize. That
             runs any code that is in such a file.
@@ -100,7 +117,9 @@ def read_agent(
     statistics, statistics_sha256 = read_statistics(path, vecnormalize, n, trust)
     network, squashed, bounds = _read_network(archive, recipe, (n, m), given, trust)
     _check_bounds(bounds, squashed, str(path))
-    parts: list[nn.Module] = [network, Rescale(bounds) if squashed else Clip(bounds)]
+    parts: list[nn.Module] = [network]
+    if not choice_sizes(archive.record):
+        parts.append(Rescale(bounds) if squashed else Clip(bounds))
     if statistics is not None:
         parts.insert(0, Normalise(statistics))
     return Agent(
@@ -137,6 +156,9 @@ def _read_network(
     try:
         return _rebuilt(archive, recipe, sizes, given)
     except ExpertError as refusal:
+        if choice_sizes(archive.record) and refusal.next_step == TRUST:
+            step = "load it with its own library, and pass the agent itself: distill(agent, env)"
+            raise ExpertError(refusal.found, refusal.expected, step) from refusal
         if trust is None or refusal.next_step != TRUST:
             raise
     from fdtasil.experts.sb3.trusted import unpickle_agent
@@ -150,9 +172,28 @@ def _rebuilt(
 ) -> tuple[nn.Module, bool, Bounds]:
     source = str(archive.path)
     activation = read_activation(archive.record, recipe, source)
-    bounds = given or read_bounds(archive.record, sizes[1], source)
-    network = build_network(archive.weights(), recipe, activation, sizes, source)
-    return network, recipe.squashed, bounds
+    if not choice_sizes(archive.record):
+        bounds = given or read_bounds(archive.record, sizes[1], source)
+        network = build_network(archive.weights(), recipe, activation, sizes, source)
+        return network, recipe.squashed, bounds
+    n, m = sizes
+    each = _quantiles(archive, recipe)
+    network = build_network(archive.weights(), recipe, activation, (n, each * m), source)
+    if each > 1:
+        network.append(MeanOfQuantiles(each))
+    return network, False, no_bounds(m)
+
+
+def _quantiles(archive: Archive, recipe: Recipe) -> int:
+    """Return how many numbers stand for each score."""
+    count = archive.record.get(recipe.quantiles) if recipe.quantiles else 1
+    if isinstance(count, int) and 0 < count <= _MOST_QUANTILES:
+        return count
+    raise ExpertError(
+        f"{archive.path} has {recipe.quantiles} {shown(count)}",
+        f"1 to {_MOST_QUANTILES:,} quantiles",
+        "save the agent again",
+    )
 
 
 def _check_bounds(bounds: Bounds, squashed: bool, source: str) -> None:

@@ -15,7 +15,7 @@ from fdtasil.experts.sb3.spaces import Bounds
 from fdtasil.experts.sb3.trust import TRUST
 from fdtasil.files.onnx.graph import Graph
 
-__all__ = ["Clip", "Normalise", "Rescale", "build_network"]
+__all__ = ["Clip", "MeanOfQuantiles", "Normalise", "Rescale", "build_network"]
 
 
 @dataclass(frozen=True)
@@ -100,6 +100,23 @@ class Clip(_Bounded):
         """Add its nodes to an ONNX graph; see `Writable`."""
         raised = graph.node("Max", value, graph.constant(self.low))
         return graph.node("Min", raised, graph.constant(self.high))
+
+
+class MeanOfQuantiles(nn.Module):
+    """Takes the quantiles of each score to their mean."""
+
+    def __init__(self, count: int) -> None:
+        super().__init__()
+        self.count = count
+
+    def forward(self, quantiles: Tensor) -> Tensor:
+        """(B, count * m) -> (B, m)."""
+        return quantiles.unflatten(1, (self.count, -1)).mean(dim=1)
+
+    def write_onnx(self, graph: Graph, value: str) -> str:
+        """Add its nodes to an ONNX graph; see `Writable`."""
+        apart = graph.node("Reshape", value, graph.integers([0, self.count, -1]))
+        return graph.node("ReduceMean", apart, graph.integers([1]), keepdims=0)
 
 
 def build_network(

@@ -38,6 +38,7 @@ class Recipe:
         squashed: Whether a tanh and a rescaling to the action bounds come last; otherwise the
             actions are clipped to the bounds.
         package: Where the class is imported from, with trust only.
+        quantiles: Entry of the record with the number of quantiles that stand for each score.
     """
 
     algorithm: str
@@ -48,6 +49,7 @@ class Recipe:
     activation: type[nn.Module]
     squashed: bool
     package: str = field(default="stable_baselines3")
+    quantiles: str | None = None
 
 
 _GAUSSIAN = {
@@ -76,6 +78,7 @@ _ON_POLICY = {
     "activation": nn.Tanh,
     "squashed": False,
 }
+_OF_CHOICES = {"activation": nn.ReLU, "squashed": False}
 # Nothing in a zip names its algorithm: the settings it was saved with tell. The first one fits.
 RECIPES = (
     Recipe(
@@ -91,6 +94,24 @@ RECIPES = (
         {"target_entropy": None, "ent_coef": None, "target_update_interval": None},
         frozenset({"stable_baselines3.sac.policies.SACPolicy"}),
         **_GAUSSIAN,
+    ),
+    Recipe(
+        "QRDQN",
+        {"exploration_fraction": None, "n_quantiles": None},
+        frozenset({"sb3_contrib.qrdqn.policies.QRDQNPolicy"}),
+        ("quantile_net.quantile_net",),
+        ("quantile_net_target",),
+        package="sb3_contrib",
+        quantiles="n_quantiles",
+        **_OF_CHOICES,
+    ),
+    Recipe(
+        "DQN",
+        {"exploration_fraction": None, "target_update_interval": None},
+        frozenset({"stable_baselines3.dqn.policies.DQNPolicy"}),
+        ("q_net.q_net",),
+        ("q_net_target",),
+        **_OF_CHOICES,
     ),
     Recipe("DDPG", {"policy_delay": 1, "target_noise_clip": 0.0}, **_DETERMINISTIC),
     Recipe("TD3", {"policy_delay": None, "target_noise_clip": None}, **_DETERMINISTIC),

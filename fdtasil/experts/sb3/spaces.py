@@ -10,14 +10,17 @@ from numpy.typing import ArrayLike
 
 from fdtasil.errors import ExpertError, SettingError, shown
 
-__all__ = ["Bounds", "given_bounds", "read_bounds", "read_size"]
+__all__ = ["Bounds", "choice_sizes", "given_bounds", "no_bounds", "read_bounds", "read_size"]
 
 _BOX = re.compile(r"<class '(?:gym|gymnasium)\.spaces\.box\.Box'>")
 _LARGEST = 10**6
 _ADVICE = {
     "observation_space": "train on flat observations (gymnasium.wrappers.FlattenObservation)",
-    "action_space": "fdtasil distils continuous controllers only; choose another agent",
+    "action_space": "choose an agent of continuous or of discrete actions",
 }
+_CHOICE = re.compile(
+    r"<class '(?:gym|gymnasium)\.spaces\.(?:multi_)?discrete\.(?:Multi)?Discrete'>"
+)
 
 
 @dataclass(frozen=True)
@@ -28,12 +31,31 @@ class Bounds:
     high: np.ndarray
 
 
+def choice_sizes(record: Mapping[str, Any]) -> tuple[int, ...]:
+    """Return how many possibilities each choice of an agent's actions has; () for numbers."""
+    entry = record.get("action_space")
+    if not isinstance(entry, dict) or not _CHOICE.fullmatch(str(entry.get(":type:"))):
+        return ()
+    text = str(entry.get("nvec", entry.get("n")))
+    sizes = tuple(int(word) for word in re.findall(r"\d+", text)) if len(text) < 10_000 else ()
+    return sizes if sizes and all(1 < size <= _LARGEST for size in sizes) else ()
+
+
+def no_bounds(size: int) -> Bounds:
+    """Return the bounds of scores, which have none."""
+    wide = np.full(size, np.inf, np.float32)
+    return Bounds(-wide, wide)
+
+
 def read_size(record: Mapping[str, Any], name: str, source: str) -> int:
-    """Return the length of a flat continuous space, n or m.
+    """Return the length of a flat space, n or m; of choices, the number of their scores.
 
     Raises:
         ExpertError: If the space is another one.
     """
+    sizes_of_choices = choice_sizes(record) if name == "action_space" else ()
+    if sizes_of_choices:
+        return sum(sizes_of_choices)
     entry = record.get(name)
     if not isinstance(entry, dict):
         raise ExpertError(
@@ -50,7 +72,7 @@ def read_size(record: Mapping[str, Any], name: str, source: str) -> int:
             return sizes[0]
     raise ExpertError(
         shown(f"{source} has the {name} {kind} of shape {shape} and dtype {dtype}"),
-        "a Box of floats with one dimension",
+        "a Box of floats with one dimension" + ", or choices" * (name == "action_space"),
         _ADVICE[name],
     )
 

@@ -1,6 +1,6 @@
 """Torch modules as ONNX graphs: a layer is a node or a few, and a module may write its own."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -39,6 +39,14 @@ class Graph:
         plain = value.detach().cpu().numpy() if isinstance(value, Tensor) else value
         name, array = f"constant_{len(self.constants)}", np.array(plain, np.float32)
         self.constants.append(numpy_helper.from_array(array, name))
+        return name
+
+    def integers(self, values: Sequence[int] | int) -> str:
+        """Add a constant of integers, and return its name."""
+        from onnx import numpy_helper
+
+        name = f"constant_{len(self.constants)}"
+        self.constants.append(numpy_helper.from_array(np.array(values, np.int64), name))
         return name
 
     def node(self, operator: str, *values: str, **attributes: Any) -> str:

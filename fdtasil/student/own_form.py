@@ -1,0 +1,156 @@
+"""A student's ONNX file in the environment's own form: choices go out, and one input a part in."""
+
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from fdtasil.errors import ExportError
+from fdtasil.rollouts.spaces import Layout, Part, Spaces
+
+if TYPE_CHECKING:
+    import onnx
+
+__all__ = ["own_form"]
+
+_FLAT, _ANSWER = "obs", "actions"
+
+
+def _with_choices(model: "onnx.ModelProto", actions: Layout) -> "onnx.ModelProto":
+    """Return a model that gives the best of its scores beside them.
+
+    Args:
+        model: Its output `actions` holds the scores.
+        actions: Of the environment.
+
+    Returns:
+        One with the outputs `scores` (batch, m) and `actions`: (batch) int64 for one choice,
+        (batch, c) for several.
+    """
+    from onnx import TensorProto, helper
+
+    nodes = _Nodes("choice")
+    for node in model.graph.node:
+        node.output[:] = ["scores" if name == _ANSWER else name for name in node.output]
+        node.input[:] = ["scores" if name == _ANSWER else name for name in node.input]
+    first = [value for part in actions.parts for value in part.first]
+    best = []
+    for (start, end), offset in zip(actions.choices, first, strict=True):
+        ends = [nodes.integers([value]) for value in (start, end, 1)]
+        mine = nodes.add("Slice", "scores", *ends)
+        chosen = nodes.add("ArgMax", mine, axis=1, keepdims=1)
+        best.append(nodes.add("Add", chosen, nodes.integers([offset])))
+    joined = nodes.add("Concat", *best, axis=1)
+    single = len(actions.parts) == 1 and not actions.parts[0].shape
+    last = nodes.add("Squeeze", joined, nodes.integers([1])) if single else joined
+    nodes.last_is(last, _ANSWER)
+    nodes.put_behind(model)
+    (scores,) = model.graph.output
+    scores.name = "scores"
+    shape = ["batch"] if single else ["batch", len(best)]
+    kind = helper.make_tensor_value_info(_ANSWER, TensorProto.INT64, shape)
+    model.graph.output.append(kind)
+    return model
+
+
+def _with_keys(model: "onnx.ModelProto", observations: Layout) -> "onnx.ModelProto":
+    """Return a model that takes each part of an observation by its name.
+
+    Args:
+        model: Its only input `obs` (batch, n) holds them all.
+        observations: Of the environment.
+
+    Raises:
+        ExportError: If the parts have no names.
+    """
+    from onnx import TensorProto, helper
+
+    if len(observations.names) < len(observations.parts):
+        raise ExportError(
+            'inputs="keys" of observations that have none',
+            "a student of a dictionary or a tuple of observations",
+            'leave inputs= out: the file takes one input, "obs"',
+        )
+    nodes, columns, inputs = _Nodes("key"), [], []
+    for part in observations.parts:
+        whole = part.kind in ("choice", "whole")
+        kind = TensorProto.INT64 if whole else TensorProto.FLOAT
+        inputs.append(helper.make_tensor_value_info(part.name, kind, ["batch", *part.shape]))
+        columns.append(_flat(nodes, part, whole))
+    nodes.last_is(nodes.add("Concat", *columns, axis=1), _FLAT)
+    nodes.put_before(model)
+    del model.graph.input[:]
+    model.graph.input.extend(inputs)
+    return model
+
+
+def own_form(model: "onnx.ModelProto", spaces: Spaces | None, *, keys: bool) -> "onnx.ModelProto":
+    """Return a student's model with what its environment's spaces ask for."""
+    if spaces is not None and spaces.actions.choices:
+        model = _with_choices(model, spaces.actions)
+    if not keys:
+        return model
+    if spaces is None:
+        return _with_keys(model, Layout((Part((), "number", (1,), "float32"),)))
+    return _with_keys(model, spaces.observations)
+
+
+def _flat(nodes: "_Nodes", part: Part, whole: bool) -> str:
+    from onnx import TensorProto
+
+    if part.kind != "choice":
+        given = nodes.add("Cast", part.name, to=TensorProto.FLOAT) if whole else part.name
+        return nodes.add("Reshape", given, nodes.integers([0, part.size]))
+    entries = nodes.add("Reshape", part.name, nodes.integers([-1, len(part.sizes)]))
+    hot = []
+    for entry, (size, first) in enumerate(zip(part.sizes, part.first, strict=True)):
+        ends = [nodes.integers([value]) for value in (entry, entry + 1, 1)]
+        mine = nodes.add("Sub", nodes.add("Slice", entries, *ends), nodes.integers([first]))
+        row = nodes.add("Squeeze", mine, nodes.integers([1]))
+        hot.append(
+            nodes.add("OneHot", row, nodes.integers([size]), nodes.floats([0.0, 1.0]), axis=1)
+        )
+    return nodes.add("Concat", *hot, axis=1)
+
+
+class _Nodes:
+    """Nodes and constants with names of their own."""
+
+    def __init__(self, prefix: str) -> None:
+        self.nodes: list[onnx.NodeProto] = []
+        self.constants: list[onnx.TensorProto] = []
+        self._prefix = prefix
+
+    def add(self, operator: str, *values: str, **attributes: Any) -> str:
+        from onnx import helper
+
+        name = f"{self._prefix}_{len(self.nodes)}"
+        self.nodes.append(helper.make_node(operator, values, [name], name, **attributes))
+        return name
+
+    def integers(self, values: list[int]) -> str:
+        return self._constant(np.array(values, np.int64))
+
+    def floats(self, values: list[float]) -> str:
+        return self._constant(np.array(values, np.float32))
+
+    def last_is(self, value: str, name: str) -> None:
+        """Name the value of the last node."""
+        assert self.nodes[-1].output[0] == value
+        self.nodes[-1].output[0] = name
+
+    def put_before(self, model: "onnx.ModelProto") -> None:
+        kept = list(model.graph.node)
+        del model.graph.node[:]
+        model.graph.node.extend([*self.nodes, *kept])
+        model.graph.initializer.extend(self.constants)
+
+    def put_behind(self, model: "onnx.ModelProto") -> None:
+        model.graph.node.extend(self.nodes)
+        model.graph.initializer.extend(self.constants)
+
+    def _constant(self, value: np.ndarray) -> str:
+        from onnx import numpy_helper
+
+        name = f"{self._prefix}_constant_{len(self.constants)}"
+        self.constants.append(numpy_helper.from_array(value, name))
+        return name

@@ -1,0 +1,204 @@
+"""Actions that are choices: scores are learnt, the best of them is taken."""
+
+import gymnasium
+import numpy as np
+import onnxruntime
+import pytest
+import torch
+from conftest import GAIN, QUICK, mlp_onnx
+from sb3_agents import fresh_agent, save_agent, shake
+from toy_forms import InForm, in_form
+
+import fdtasil
+from fdtasil.errors import ExpertError, SettingError
+from fdtasil.experts.load import expert_in
+from fdtasil.experts.sb3.agent import read_agent
+from fdtasil.rollouts.environments import EnvironmentPool
+
+pytestmark = pytest.mark.usefixtures("no_pictures")
+
+
+def law(rows):
+    return np.clip(np.asarray(rows, np.float32) @ GAIN.T, -1, 1)
+
+
+def scores(rows):
+    """Of the four choices of the toy, the sum of the two forces where they are right."""
+    left, right = law(rows).T
+    return np.stack([a * left + b * right for b in (-1, 1) for a in (-1, 1)], axis=1)
+
+
+def distilled(expert, done="choice", probes=3, **changes):
+    options = {**QUICK, "progress": False, **changes}
+    return fdtasil.distill(expert, lambda: InForm("box", done), probes, **options)
+
+
+@pytest.fixture
+def pool():
+    with EnvironmentPool(lambda: InForm("box", "choice")) as opened:
+        yield opened
+
+
+def rows_of(count=50):
+    return np.random.default_rng(1).standard_normal((count, 5)).astype(np.float32)
+
+
+def test_a_number_added_to_all_scores_is_nothing_to_be_learnt(pool):
+    rows = rows_of()
+    plain = expert_in(scores, pool).ask(rows, "check")
+    shifted = expert_in(lambda x: scores(x) + 100 * x[:, :1], pool).ask(rows, "check")
+    assert plain == pytest.approx(scores(rows), abs=1e-5)  # which sum to zero
+    assert shifted == pytest.approx(plain, abs=1e-4)
+
+
+def test_who_only_chooses_has_ones_for_scores(pool):
+    rows = rows_of()
+    chosen = expert_in(in_form(law, "box", "choice"), pool).ask(rows, "check")
+    assert np.array_equal(chosen.argmax(1), scores(rows).argmax(1))
+    assert np.array_equal(np.unique(chosen), np.float32([-0.25, 0.75]))
+    silent = lambda x: np.where(x[:, 0] > 0, 1.0, np.nan)  # noqa: E731
+    assert np.isnan(expert_in(silent, pool).ask(rows, "check")).all(1).tolist() == (
+        (rows[:, 0] <= 0).tolist()
+    )
+
+
+@pytest.mark.parametrize(
+    "answer",
+    [
+        lambda x: np.full(len(x), 5),
+        lambda x: np.zeros((len(x), 3)),
+        lambda x: np.full(len(x), 1.5),
+    ],
+)
+def test_an_answer_that_is_no_choice(answer):
+    with pytest.raises(ExpertError, match="choices"):
+        distilled(answer)
+
+
+@pytest.mark.parametrize("expert", [scores, in_form(law, "box", "choice")])
+@pytest.mark.parametrize("probes", [0, 3, "sphere:2,central", "fresh:2", "10,labels"])
+@pytest.mark.parametrize("trainer", ["bc", "dagger"])
+def test_every_source_teaches_choices(expert, probes, trainer, tmp_path):
+    result = distilled(expert, probes=probes, trainer=trainer)
+    again = distilled(expert, probes=probes, trainer=trainer)
+    assert result.student.to_bytes() == again.student.to_bytes()
+    assert 0 <= result.evaluation.agreement <= 1
+    assert "agreement" in str(result.evaluation)
+
+
+def test_scores_are_learnt_and_the_best_is_taken(tmp_path):
+    result = distilled(scores, fit=fdtasil.Fit(steps=1500), episodes=5)
+    assert result.evaluation.agreement > 0.9
+    rows = result.demonstrations.observations[:20]
+    chosen = result.student.predict(rows)[0]
+    assert np.array_equal(chosen, 1 + result.student.act(rows).argmax(1))
+    assert chosen.dtype == np.int64
+    one = result.student.predict(rows[0])[0]
+    assert one == chosen[0]
+    assert InForm("box", "choice").action_space.contains(one)
+
+    path = result.export(tmp_path / "student.onnx")
+    session = onnxruntime.InferenceSession(path)
+    found = session.run(["scores", "actions"], {"obs": rows})
+    assert found[0] == pytest.approx(result.student.act(rows), abs=1e-4)
+    assert np.array_equal(found[1], chosen)
+    environment = lambda: InForm("box", "choice")  # noqa: E731
+    for judged in (result.student, str(path)):
+        judgement = fdtasil.evaluate(judged, scores, environment, episodes=2, horizon=20)
+        assert judgement.student_returns == result.evaluation.student_returns[:2]
+        assert judgement.agreement == pytest.approx(result.evaluation.agreement)
+    # Judged as an expert: another student learns from the file.
+    assert distilled(str(path), probes=2).evaluation.expert_return == pytest.approx(
+        result.evaluation.student_return
+    )
+    result.save(tmp_path / "run")
+    read = fdtasil.Distilled.load(tmp_path / "run")
+    assert np.array_equal(read.student.predict(rows)[0], chosen)
+    small = fdtasil.distill(dataset=tmp_path / "run", fit=fdtasil.Fit(steps=5))
+    assert small.student.predict(rows)[0].dtype == np.int64
+
+
+def test_several_choices(tmp_path):
+    result = distilled(in_form(law, "box", "choices"), "choices", episodes=5)
+    rows = result.demonstrations.observations[:20]
+    chosen = result.student.predict(rows)[0]
+    assert chosen.shape == (20, 2)
+    session = onnxruntime.InferenceSession(result.export(tmp_path / "s.onnx"))
+    assert np.array_equal(session.run(["actions"], {"obs": rows})[0], chosen)
+
+
+@pytest.mark.parametrize("trainer", ["dart", "noise"])
+def test_noise_on_choices_is_refused(trainer):
+    with pytest.raises(SettingError, match="choices"):
+        distilled(scores, trainer=trainer)
+
+
+def test_the_analytic_reference_has_scores():
+    with torch.random.fork_rng():
+        network = torch.nn.Sequential(
+            torch.nn.Linear(5, 8), torch.nn.Tanh(), torch.nn.Linear(8, 4)
+        )
+    exact, asked = (distilled(network, probes=probes) for probes in ("jacobian", "basis"))
+    assert exact.answers.values.sum(axis=-1) == pytest.approx(0, abs=1e-4)
+    assert exact.demonstrations.actions == pytest.approx(asked.demonstrations.actions, abs=1e-6)
+
+
+def test_an_onnx_file_of_scores(tmp_path):
+    path = mlp_onnx(tmp_path / "q.onnx", (5, 8, 4))
+    result = distilled(str(path))
+    assert result.demonstrations.actions.shape[1] == 4
+    assert result.demonstrations.actions.sum(axis=1) == pytest.approx(0, abs=1e-4)
+    assert (
+        distilled(str(path), probes=None, fit=fdtasil.Fit(steps=5))
+        .report["probes"]
+        .startswith("adaptive:10")
+    )
+
+
+@pytest.mark.parametrize("name", ["PPO", "A2C", "DQN", "QRDQN"])
+def test_agents_that_choose(name, tmp_path):
+    agent = shake(fresh_agent(name, "CartPole-v1", {"net_arch": [9, 8]}))
+    path = save_agent(tmp_path, agent)
+    read = read_agent(path)
+    assert read.algorithm == name
+    rows = np.random.default_rng(0).standard_normal((200, 4)).astype(np.float32)
+    expected = agent.predict(rows, deterministic=True)[0]
+    found = read.module(torch.from_numpy(rows)).detach().numpy()
+    assert np.array_equal(found.argmax(1), expected)
+    with EnvironmentPool("CartPole-v1") as pool:
+        ours = [expert_in(one, pool).ask(rows, "check") for one in (str(path), agent)]
+    assert ours[0] == pytest.approx(ours[1], abs=1e-4)  # the object's own scores
+    assert np.array_equal(ours[0].argmax(1), expected)
+
+
+def test_several_choices_of_an_agent(tmp_path):
+    agent = shake(fresh_agent("PPO", InForm("box", "choices"), {}))
+    rows = rows_of()
+    expected = agent.predict(rows, deterministic=True)[0]
+    with EnvironmentPool(lambda: InForm("box", "choices")) as pool:
+        for one in (str(save_agent(tmp_path, agent)), agent):
+            found = expert_in(one, pool).ask(rows, "check")
+            assert np.array_equal(pool.spaces.actions.best(found), expected)
+
+
+def test_an_agent_exported_by_the_command(tmp_path, inside):
+    agent = shake(fresh_agent("QRDQN", "CartPole-v1", {"net_arch": [9], "n_quantiles": 7}))
+    path = save_agent(tmp_path, agent)
+    done = inside("export-sb3", path, "--out", tmp_path / "q.onnx", "--env", "CartPole-v1")
+    assert (done.returncode, done.stderr) == (0, "")
+    rows = np.random.default_rng(0).standard_normal((50, 4)).astype(np.float32)
+    session = onnxruntime.InferenceSession(tmp_path / "q.onnx")
+    (found,) = session.run(None, {"obs": rows})
+    assert np.array_equal(found.argmax(1), agent.predict(rows, deterministic=True)[0])
+
+
+def test_stable_baselines3_evaluates_a_student():
+    from stable_baselines3.common.evaluation import evaluate_policy
+    from stable_baselines3.common.monitor import Monitor
+
+    balance = lambda x: (x[:, 2] + 0.5 * x[:, 3] > 0).astype(int)  # noqa: E731
+    options = {**QUICK, "episodes": 3, "horizon": 100, "fit": fdtasil.Fit(steps=1500)}
+    result = fdtasil.distill(balance, "CartPole-v1", "10,labels", **options)
+    environment = Monitor(gymnasium.make("CartPole-v1"))
+    mean, _ = evaluate_policy(result.student, environment, n_eval_episodes=2, warn=False)
+    assert mean > 50
