@@ -30,6 +30,7 @@ from fdtasil.version import __version__
 if TYPE_CHECKING:
     from fdtasil.demonstrations.dataset import Dataset
     from fdtasil.demonstrations.minari_data import from_minari, to_minari
+    from fdtasil.demonstrations.plain_arrays import from_arrays
     from fdtasil.demonstrations.trainers import DAgger, Dart, NoisyExpert
     from fdtasil.errors import FdtasilError, FdtasilWarning
     from fdtasil.experts.expert import Expert
@@ -67,6 +68,7 @@ __all__ = [
     "__version__",
     "distill",
     "evaluate",
+    "from_arrays",
     "from_minari",
     "gains",
     "load_expert",
@@ -77,6 +79,7 @@ __all__ = [
 _ROOMS = {
     "demonstrations.dataset": ("Dataset",),
     "demonstrations.minari_data": ("from_minari", "to_minari"),
+    "demonstrations.plain_arrays": ("from_arrays",),
     "demonstrations.trainers": ("DAgger", "Dart", "NoisyExpert"),
     "errors": ("FdtasilError", "FdtasilWarning"),
     "experts.expert": ("Expert",),

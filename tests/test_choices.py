@@ -2,10 +2,12 @@
 
 import gymnasium
 import numpy as np
+import onnx
 import onnxruntime
 import pytest
 import torch
 from conftest import GAIN, QUICK, mlp_onnx
+from onnx import TensorProto, helper, numpy_helper
 from sb3_agents import fresh_agent, save_agent, shake
 from toy_forms import InForm, in_form
 
@@ -153,6 +155,32 @@ def test_an_onnx_file_of_scores(tmp_path):
         .report["probes"]
         .startswith("adaptive:10")
     )
+
+
+@pytest.mark.parametrize("shape", [("batch",), ("batch", 1)])
+def test_an_onnx_file_that_only_chooses(shape, tmp_path):
+    """As a classifier of another library is exported: a label, and nothing beside it."""
+    weights = [numpy_helper.from_array(np.float32(np.eye(5)[:, :4]), "w")]
+    keep = int(len(shape) > 1)
+    nodes = [
+        helper.make_node("MatMul", ["obs", "w"], ["z"]),
+        helper.make_node("ArgMax", ["z"], ["best"], axis=1, keepdims=keep),
+        helper.make_node("Add", ["best", "one"], ["label"]),
+    ]
+    weights.append(numpy_helper.from_array(np.array([1] * keep or 1, np.int64), "one"))
+    graph = helper.make_graph(
+        nodes,
+        "chooser",
+        [helper.make_tensor_value_info("obs", TensorProto.FLOAT, ["batch", 5])],
+        [helper.make_tensor_value_info("label", TensorProto.INT64, shape)],
+        weights,
+    )
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
+    onnx.save(model, tmp_path / "c.onnx")
+    result = distilled(str(tmp_path / "c.onnx"))
+    states = result.demonstrations
+    expected = states.observations[:, :4].argmax(1)
+    assert np.array_equal(states.actions.argmax(1), expected)
 
 
 @pytest.mark.parametrize("name", ["PPO", "A2C", "DQN", "QRDQN"])

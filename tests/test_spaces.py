@@ -2,11 +2,13 @@
 
 import gymnasium
 import numpy as np
+import onnx
 import onnxruntime
 import pytest
 import torch
 from conftest import GAIN, QUICK
 from gymnasium.spaces import Box, Dict, Discrete, Sequence, Text
+from onnx import TensorProto, helper, numpy_helper
 from sb3_agents import fresh_agent
 from toy_forms import ACTIONS, OBSERVATIONS, InForm, in_form
 
@@ -309,3 +311,50 @@ def test_clip_action_hides_no_bounds():
     clipped = lambda: gymnasium.wrappers.ClipAction(InForm())  # noqa: E731
     result = fdtasil.distill(law, clipped, 3, **QUICK)
     assert result.student.high.tolist() == [1.0, 1.0]
+
+
+def keyed_onnx(path, sizes):
+    """A file with an input for each key, whose actions are the law of all of them."""
+    inputs = [
+        helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", *shape])
+        for name, shape in sizes.items()
+    ]
+    weights = [
+        numpy_helper.from_array(GAIN.T.copy(), "gain"),
+        numpy_helper.from_array(np.array([-1, 5]), "flat"),
+        numpy_helper.from_array(np.float32(-1), "low"),
+        numpy_helper.from_array(np.float32(1), "high"),
+    ]
+    nodes = [
+        helper.make_node("Concat", list(sizes), ["joined"], axis=1),
+        helper.make_node("Reshape", ["joined", "flat"], ["row"]),
+        helper.make_node("MatMul", ["row", "gain"], ["force"]),
+        helper.make_node("Clip", ["force", "low", "high"], ["actions"]),
+    ]
+    outputs = [helper.make_tensor_value_info("actions", TensorProto.FLOAT, ["batch", 2])]
+    graph = helper.make_graph(nodes, "keyed", inputs, outputs, weights)
+    model = helper.make_model(graph, opset_imports=[helper.make_opsetid("", 17)], ir_version=9)
+    onnx.save(model, path)
+    return str(path)
+
+
+@pytest.mark.parametrize(
+    ("form", "sizes"),
+    [
+        ("dictionary", {"place": (2,), "speed": (2,), "rest": (1,)}),
+        ("row", {"frames": (1, 5)}),
+        ("box", {"frames": (1, 5)}),
+        ("nested", {"robot": (4,), "goal": (1,)}),
+    ],
+)
+def test_inputs_of_a_file_are_found_by_name_and_shape(form, sizes, plain, tmp_path):
+    path = keyed_onnx(tmp_path / "keys.onnx", sizes)
+    result = fdtasil.distill(path, lambda: InForm(form), 3, **QUICK, progress=False)
+    assert result.demonstrations.actions == pytest.approx(plain.demonstrations.actions, abs=1e-5)
+    assert result.evaluation.expert_return == pytest.approx(plain.evaluation.expert_return)
+
+
+def test_inputs_that_no_key_has_are_asked_for(tmp_path):
+    path = keyed_onnx(tmp_path / "keys.onnx", {"place": (2,), "pace": (2,), "peace": (1,)})
+    with pytest.raises(fdtasil.FdtasilError, match="'pace' and 'peace'"):
+        fdtasil.distill(path, lambda: InForm("dictionary"), 3, **QUICK)

@@ -113,9 +113,7 @@ def load_dataset(source: DatasetLike) -> Dataset:
         raise SettingError(
             f"dataset is a {type(source).__name__}",
             "a Dataset, a run folder, or its demonstrations.npz",
-            "of arrays: Dataset(Demonstrations(observations, actions, episode, round, actions, "
-            'rewards, terminated), None, None, low, high, "name"), Demonstrations is in '
-            "fdtasil.demonstrations.states",
+            "of arrays: fdtasil.from_arrays(observations, actions, episode_ends=...)",
         )
     path = check_path("dataset", source)
     file = path / "demonstrations.npz" if path.is_dir() else path

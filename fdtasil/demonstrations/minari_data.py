@@ -16,6 +16,8 @@ from fdtasil.files.hdf5 import check_hdf5
 from fdtasil.files.names import check_no_links, stays_inside
 from fdtasil.files.reading import from_json, read_plain
 from fdtasil.files.storage import remove_folder
+from fdtasil.rollouts.flattening import bounds_of
+from fdtasil.rollouts.spaces import Mismatch, Spaces, UnknownSpace, layout_of
 
 if TYPE_CHECKING:
     import minari
@@ -37,7 +39,7 @@ def from_minari(source: "str | minari.MinariDataset") -> Dataset:
 
     Raises:
         StorageError: If there is no such dataset.
-        SettingError: If its spaces are not flat boxes, or minari is not installed.
+        SettingError: If its spaces have no flat form, or minari is not installed.
     """
     name = source if isinstance(source, str) else source.spec.dataset_id
     read = reads(
@@ -63,25 +65,34 @@ def _dataset_of(source: "str | minari.MinariDataset", minari: Any) -> Dataset:
     else:
         data = source
         _check_files(Path(data.storage.data_path))
-    spaces = (data.observation_space, data.action_space)
-    if not all(isinstance(s, gymnasium.spaces.Box) and len(s.shape) == 1 for s in spaces):
-        raise SettingError(
-            f"a dataset with observations {shown(spaces[0])} and actions {shown(spaces[1])}",
-            "boxes with one dimension",
-            "flatten it, or choose another",
-        )
-    sizes = spaces[0].shape[0], spaces[1].shape[0]
+    spaces = _spaces_of(data)
     episodes = [
-        _read(number, episode, sizes) for number, episode in enumerate(data.iterate_episodes())
+        _read(number, episode, spaces) for number, episode in enumerate(data.iterate_episodes())
     ]
     if not episodes:
         raise StorageError(f"{source!r} has no episodes", "at least one", "choose another dataset")
     states = episodes[0]
     for episode in episodes[1:]:
         states = states + episode
-    low, high = (np.asarray(bound, np.float32) for bound in (spaces[1].low, spaces[1].high))
+    ends = bounds_of(data.action_space, spaces.actions)
+    low, high = (np.asarray(bound, np.float32) for bound in ends)
     name = data.env_spec.id if data.env_spec else data.spec.dataset_id
-    return Dataset(states, None, None, low, high, str(name))
+    kept = None if spaces.plain else spaces
+    return Dataset(states, None, None, low, high, str(name), kept)
+
+
+def _spaces_of(data: "minari.MinariDataset") -> Spaces:
+    try:
+        return Spaces(
+            layout_of(data.observation_space, "observations"),
+            layout_of(data.action_space, "actions"),
+        )
+    except UnknownSpace as unknown:
+        raise SettingError(
+            f"a dataset with {shown(str(unknown))}",
+            "boxes and choices, and dictionaries and tuples of them",
+            "flatten it, or choose another",
+        ) from None
 
 
 def _folder_of(dataset_id: str) -> Path:
@@ -183,12 +194,16 @@ def to_minari(dataset: Dataset, dataset_id: str, **about: str) -> "minari.Minari
         ) from error
 
 
-def _read(number: int, episode: Any, sizes: tuple[int, int]) -> Demonstrations:
-    steps, (n, m) = len(episode.rewards), sizes
-    taken = np.asarray(episode.actions, np.float32)[:steps]
+def _read(number: int, episode: Any, spaces: Spaces) -> Demonstrations:
+    steps, n, m = len(episode.rewards), spaces.observations.size, spaces.actions.size
+    try:
+        taken = spaces.actions.centred(spaces.actions.rows(episode.actions))
+        observations = spaces.observations.rows(episode.observations)
+    except Mismatch as mismatch:
+        raise ValueError(f"episode {number} has {mismatch}") from None
+    taken, observations = (part.astype(np.float32)[:steps] for part in (taken, observations))
     infos = episode.infos or {}
     labels = np.asarray(infos.get(EXPERT_ACTION, taken), np.float32)[:steps]
-    observations = np.asarray(episode.observations, np.float32)[:steps]
     rewards = np.asarray(episode.rewards, np.float64)
     terminated = np.asarray(episode.terminations, bool)
     shapes = [array.shape for array in (observations, taken, labels, rewards, terminated)]

@@ -147,16 +147,31 @@ def load_expert(
     return with_processes(expert, _opener(source, expert, hints), workers, timeout)
 
 
-def expert_in(source: ExpertLike, pool: EnvironmentPool) -> Expert:
+def expert_in(
+    source: ExpertLike,
+    pool: EnvironmentPool,
+    *,
+    output: str | None = None,
+    inputs: Inputs | None = None,
+    trust: Trust = None,
+) -> Expert:
     """Open an expert for an environment, whose own form of observations it may take.
+
+    Args:
+        source: The expert.
+        pool: The environment.
+        output: As in `load_expert`.
+        inputs: As there.
+        trust: As there.
 
     Raises:
         ExpertError: If it can't be opened, or does not fit the environment.
     """
     n, m = pool.boxes.observation_size, pool.boxes.action_size
     if pool.spaces.plain:
-        return load_expert(source, n, m)
-    hints = Hints(n, m, spaces=pool.spaces)
+        return load_expert(source, n, m, output=output, inputs=inputs, trust=trust)
+    bound = None if inputs is None else check_inputs(inputs)
+    hints = Hints(n, m, output, trust, inputs=bound, spaces=pool.spaces)
     return sized(in_spaces(open_expert(source, hints), pool.spaces), n, m)
 
 

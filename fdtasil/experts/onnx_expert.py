@@ -1,12 +1,16 @@
 """ONNX files as experts, with the names, types and batch sizes that users' files have."""
 
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import numpy as np
 from torch.nn import Module
 
-from fdtasil.errors import ExpertError, SettingError, shown
+from fdtasil.errors import ExpertError, FdtasilError, SettingError, shown
 from fdtasil.experts.cost import stored_numbers
 from fdtasil.experts.expert import Expert, Hints
 from fdtasil.experts.memory import Memory, stateless
@@ -22,6 +26,7 @@ from fdtasil.files.onnx.policy import (
     open_within_limits,
 )
 from fdtasil.files.onnx.recurrent import RecurrentPolicy, find_memory, try_recurrent
+from fdtasil.rollouts.spaces import Spaces
 
 if TYPE_CHECKING:
     import onnx
@@ -50,11 +55,11 @@ def open_onnx(source: str | Path, hints: Hints) -> Expert:
     model, digest = read_model(path)
     columns = _columns(model, path)
     wanted = None if columns else hints.observation_size
-    pairs = find_memory(model, hints.memory, list(hints.inputs or ()))
+    with _damage_is_named(path):
+        pairs = find_memory(model, hints.memory, list(hints.inputs or ()))
     if pairs:
         return _recurrent(source, model, digest, pairs, hints)
-    if hints.inputs:
-        model = bind(model, hints.inputs, wanted)
+    model = _bound(model, hints, wanted, path)
     data = model.SerializeToString()
     n = _declared_size(model)
     if n and wanted not in (None, n):
@@ -63,7 +68,8 @@ def open_onnx(source: str | Path, hints: Hints) -> Expert:
             "an expert of this environment",
             size_hint(n, wanted),
         )
-    call = (data, str(path), wanted, hints.action_size, hints.output)
+    choices = len(hints.spaces.actions.choices) if hints.spaces else 0
+    call = (data, str(path), wanted, hints.action_size, hints.output, choices)
     work = partial(open_within_limits, *call, straight=_is_straight(model))
     try_out(digest, str(path), work)
     policy, n, m = open_policy(*call)
@@ -107,6 +113,48 @@ def _recurrent(
         source=name,
         memory=Memory(k, policy),
     )
+
+
+def _bound(
+    model: "onnx.ModelProto", hints: Hints, wanted: int | None, path: Path
+) -> "onnx.ModelProto":
+    """Return a model with one flat input, where what it is given is said or can be told."""
+    with _damage_is_named(path):
+        inputs = hints.inputs or _natural_inputs(model, hints.spaces)
+        return bind(model, inputs, wanted) if inputs else model
+
+
+@contextmanager
+def _damage_is_named(path: Path) -> Iterator[None]:
+    """Name the file: names and shapes of a damaged one may be anything."""
+    try:
+        yield
+    except FdtasilError:
+        raise
+    except Exception as error:
+        raise cannot_be_asked(str(path), error) from error
+
+
+def _natural_inputs(
+    model: "onnx.ModelProto", spaces: Spaces | None
+) -> dict[str, slice | np.ndarray]:
+    """Return what inputs are given whose names or shapes say it.
+
+    An input that has the name of a part of the observation is given that part, and the only one
+    is given all of it where it takes a stack of frames.
+    """
+    constants = {tensor.name for tensor in model.graph.initializer}
+    entries = [entry for entry in model.graph.input if entry.name not in constants]
+    if len(entries) == 1:
+        sizes = [d.dim_value for d in entries[0].type.tensor_type.shape.dim][1:]
+        stacked = len(sizes) > 1 and all(size > 0 for size in sizes)
+        return {entries[0].name: slice(0, math.prod(sizes))} if stacked else {}
+    found: dict[str, slice | np.ndarray] = {}
+    for entry in entries:
+        with suppress(KeyError):
+            columns = spaces.observations.columns(entry.name) if spaces else {}[entry.name]
+            found[entry.name] = slice(columns[0], columns[-1] + 1)
+    return found
 
 
 def _declared_size(model: "onnx.ModelProto") -> int:

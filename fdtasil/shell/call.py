@@ -5,18 +5,63 @@ from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
-from fdtasil.experts.load import ExpertLike, load_expert
+from fdtasil.errors import SettingError, shown
+from fdtasil.experts.load import ExpertLike, expert_in, load_expert
+from fdtasil.files.reading import from_json
 from fdtasil.results.distilled import Distilled
 from fdtasil.rollouts.environments import EnvironmentPool
+from fdtasil.rollouts.wanted import Environment
 from fdtasil.run.events import Log
 from fdtasil.run.pipeline import distill
 from fdtasil.run.presets import preset_of
+from fdtasil.shell.command import OptionalText
 from fdtasil.student.architectures import Mlp
 from fdtasil.student.fit import Fit
 
-__all__ = ["distil", "opened"]
+__all__ = ["ENVIRONMENT_FLAGS", "KWARGS_TEXT", "OPTIONS_TEXT", "distil", "opened", "wanted"]
 
 Arguments = Mapping[str, Any]
+
+KWARGS_TEXT = """What the environment is made with, as JSON: '{"healthy_z_range": [0.8, 2.0]}'."""
+OPTIONS_TEXT = "What each reset is given as its options, as JSON."
+ENVIRONMENT_FLAGS: dict[str, tuple[Any, Any, str]] = {
+    "env_kwargs": (OptionalText, None, KWARGS_TEXT),
+    "reset_options": (OptionalText, None, OPTIONS_TEXT),
+    "num_envs": (
+        int,
+        0,
+        "Environments that step together, each in a process of its own; 0 for copies in this one.",
+    ),
+}
+"""Arguments of a command: how an environment is made and reset."""
+
+
+def wanted(
+    env: str | None, env_kwargs: str | None, reset_options: str | None, num_envs: int = 0
+) -> Environment | str | None:
+    """Return an environment that is made and reset as flags say; its id, where they say nothing.
+
+    Raises:
+        SettingError: If a text is no JSON object.
+    """
+    if env is None or not (env_kwargs or reset_options or num_envs):
+        return env
+    kwargs, options = _object("env_kwargs", env_kwargs), _object("reset_options", reset_options)
+    return Environment(env, kwargs, options, num_envs)
+
+
+def _object(name: str, text: str | None) -> dict[str, Any] | None:
+    if text is None:
+        return None
+    try:
+        found = from_json(text.encode())
+    except ValueError:
+        found = None
+    if not isinstance(found, dict):
+        flag = f"--{name.replace('_', '-')}"
+        example = f"""write {flag} '{{"name": 1.0}}'"""
+        raise SettingError(f"{name}={shown(text)!r}", "a JSON object", example)
+    return found
 
 
 def distil(arguments: Arguments, *, progress: bool = True) -> Distilled:
@@ -35,6 +80,7 @@ def distil(arguments: Arguments, *, progress: bool = True) -> Distilled:
     network = {name: value for name, value in said.items() if value is not None}
     output, inputs, trust = (rest.pop(name) for name in ("output", "inputs", "trust"))
     formats = rest.pop("log_formats")
+    rest["env"] = wanted(rest["env"], *(rest.pop(name) for name in ENVIRONMENT_FLAGS))
     rest["expert"] = opened(rest["expert"], rest["env"], output=output, inputs=inputs, trust=trust)
     folder = Path(rest["out"] or rest["resume"] or ".")
     return distill(
@@ -48,7 +94,7 @@ def distil(arguments: Arguments, *, progress: bool = True) -> Distilled:
 
 def opened(
     expert: str | None,
-    env: str | None,
+    env: Environment | str | None,
     *,
     output: str | None,
     inputs: str | None,
@@ -63,6 +109,5 @@ def opened(
         return expert
     if env is None:
         return load_expert(expert, output=output, inputs=inputs, trust=trust)
-    with EnvironmentPool(env) as pool:  # whose sizes tell which output holds the actions
-        sizes = pool.boxes.observation_size, pool.boxes.action_size
-    return load_expert(expert, *sizes, output=output, inputs=inputs, trust=trust)
+    with EnvironmentPool(env) as pool:  # whose spaces tell which output holds the actions
+        return expert_in(expert, pool, output=output, inputs=inputs, trust=trust)

@@ -22,7 +22,7 @@ from fdtasil.results.distilled import Distilled
 from fdtasil.results.evaluation import Evaluation, interval_text, score_text
 from fdtasil.run.pipeline import distill
 from fdtasil.shell.beside import evaluated_beside
-from fdtasil.shell.call import distil
+from fdtasil.shell.call import ENVIRONMENT_FLAGS, distil
 from fdtasil.shell.command import (
     Flags,
     OptionalEnvironment,
@@ -213,6 +213,7 @@ command = as_command(
         Flags(load_expert, only=("output", "inputs", "trust"), types={"inputs": str | None}),
     ],
     {
+        **ENVIRONMENT_FLAGS,
         "log_formats": (
             tuple[str, ...],
             (),

@@ -4,7 +4,7 @@ from typing import Any
 
 from fdtasil.experts.load import load_expert
 from fdtasil.run.pipeline import evaluate
-from fdtasil.shell.call import opened
+from fdtasil.shell.call import ENVIRONMENT_FLAGS, opened, wanted
 from fdtasil.shell.command import EnvironmentId, Flags, PolicyPath, as_command, import_module_of
 
 __all__ = ["command"]
@@ -20,11 +20,13 @@ def _evaluate(
     **arguments: Any,
 ) -> None:
     import_module_of(env)
-    judge = opened(expert, env, output=output, inputs=inputs, trust=trust)
+    place = wanted(env, *(arguments.pop(name) for name in ENVIRONMENT_FLAGS))
+    assert place is not None
+    judge = opened(expert, place, output=output, inputs=inputs, trust=trust)
     assert judge is not None
     compiled = policy.endswith(".c")  # the only policy that asks for trust of its own
     judged = load_expert(policy, trust=trust) if compiled else policy
-    print(evaluate(judged, expert=judge, env=env, **arguments))
+    print(evaluate(judged, expert=judge, env=place, **arguments))
 
 
 command = as_command(
@@ -42,5 +44,5 @@ command = as_command(
         ),
         Flags(load_expert, only=("output", "inputs", "trust"), types={"inputs": str | None}),
     ],
-    {},
+    ENVIRONMENT_FLAGS,
 )

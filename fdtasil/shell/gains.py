@@ -12,7 +12,7 @@ from fdtasil.files.storage import write_bytes
 from fdtasil.probes.gains import Gains, gains
 from fdtasil.probes.scales import measure_scales
 from fdtasil.rollouts.environments import EnvironmentPool
-from fdtasil.shell.call import opened
+from fdtasil.shell.call import opened, wanted
 from fdtasil.shell.command import EnvironmentId, ExpertPath, import_module_of
 
 __all__ = ["command"]
@@ -30,6 +30,8 @@ def command(
     trust: Literal["pickle", "c"] | None = None,
     horizon: int | None = None,
     seed: int = 0,
+    env_kwargs: str | None = None,
+    reset_options: str | None = None,
 ) -> None:
     """Find the Jacobian of any expert at states that it visits, with an estimate of the error.
 
@@ -45,13 +47,17 @@ def command(
             code that is in it.
         horizon: Steps after which the episode is cut; default: the environment's time limit.
         seed: Of the episode.
+        env_kwargs: What the environment is made with, as JSON.
+        reset_options: What each reset is given as its options, as JSON.
     """
     check_count("states", states)
     file = None if out is None else out.absolute()  # an environment may change the folder
     import_module_of(env)
-    source = opened(expert, env, output=output, inputs=inputs, trust=trust)
+    place = wanted(env, env_kwargs, reset_options)
+    source = opened(expert, place, output=output, inputs=inputs, trust=trust)
     assert source is not None
-    with EnvironmentPool(env) as pool:
+    assert place is not None
+    with EnvironmentPool(place) as pool:
         looked = look_closely(source, pool, horizon, seed, 1, with_chance=False)
         problem = next((f.problem for f in looked.findings if f.problem), None)
         if looked.own is None:

@@ -13,7 +13,7 @@ from fdtasil.results.figures import draw_calibration
 from fdtasil.rollouts.environments import EnvironmentPool
 from fdtasil.run.presets import PRESETS
 from fdtasil.seeding import generator
-from fdtasil.shell.call import opened
+from fdtasil.shell.call import opened, wanted
 from fdtasil.shell.command import EnvironmentId, ExpertPath, import_module_of
 
 __all__ = ["command"]
@@ -32,6 +32,8 @@ def command(
     episodes: int = 5,
     horizon: int | None = None,
     seed: int = 0,
+    env_kwargs: str | None = None,
+    reset_options: str | None = None,
     picture: Path | None = None,
 ) -> None:
     """Show what an expert is: its contract with the environment, and the return it reaches.
@@ -47,15 +49,19 @@ def command(
         episodes: Episodes that the return is measured over.
         horizon: Steps after which an episode is cut; default: the environment's time limit.
         seed: Of the episodes.
+        env_kwargs: What the environment is made with, as JSON.
+        reset_options: What each reset is given as its options, as JSON.
         picture: PNG file to draw the ladder of radii into.
     """
     check_count("episodes", episodes)
     # Absolute from the beginning: an environment may change the working folder.
     file = None if picture is None else picture.absolute()
     import_module_of(env)
-    source = opened(expert, env, output=output, inputs=inputs, trust=trust)
+    place = wanted(env, env_kwargs, reset_options)
+    source = opened(expert, place, output=output, inputs=inputs, trust=trust)
     assert source is not None
-    with EnvironmentPool(env) as pool:
+    assert place is not None
+    with EnvironmentPool(place) as pool:
         looked = look_closely(source, pool, horizon, seed, episodes)
         rows = [
             ("expert", without_secrets(expert)),
@@ -84,7 +90,7 @@ def _contract(looked: Looked, pool: EnvironmentPool) -> list[tuple[str, object]]
     boxes, expert = pool.boxes, looked.expert
     rows: list[tuple[str, object]] = [
         ("observations", boxes.observation_size),
-        ("actions", f"{boxes.action_size}, from {boxes.low.min():g} to {boxes.high.max():g}"),
+        ("actions", _actions(pool)),
     ]
     if expert is not None:
         rows.insert(0, ("sha256", expert.sha256))
@@ -94,6 +100,14 @@ def _contract(looked: Looked, pool: EnvironmentPool) -> list[tuple[str, object]]
         for finding in looked.findings
         if finding.name != "opening" or finding.problem
     ]
+
+
+def _actions(pool: EnvironmentPool) -> str:
+    boxes, choices = pool.boxes, pool.spaces.actions.choices
+    if choices:
+        counts = ", ".join(str(stop - start) for start, stop in choices)
+        return f"{boxes.action_size} scores of choices, of {counts} each"
+    return f"{boxes.action_size}, from {boxes.low.min():g} to {boxes.high.max():g}"
 
 
 def _calibrated(looked: Looked, seed: int) -> Calibration | None:

@@ -1,5 +1,6 @@
 """Several inputs of an ONNX model made one: columns of the observation, or constants."""
 
+import math
 from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any
 
@@ -98,7 +99,7 @@ def bind(
         kind = entries[name].type.tensor_type
         feed = _Feed(f"fdtasil.{number}", name, kind.elem_type)
         if isinstance(part, slice):
-            feed.take(part)
+            feed.take(part, [dimension.dim_value for dimension in kind.shape.dim])
         else:
             feed.hold(part, [dimension.dim_value for dimension in kind.shape.dim])
         nodes += feed.nodes
@@ -161,7 +162,7 @@ def _complete(
 def _check_width(entry: "onnx.ValueInfoProto", part: "slice | np.ndarray", listed: str) -> None:
     """Refuse columns, or a constant, that an input has no place for."""
     dimensions = entry.type.tensor_type.shape.dim
-    width = dimensions[-1].dim_value if len(dimensions) == 2 else 0
+    width = math.prod(dimension.dim_value for dimension in dimensions[1:])
     if not width:
         return
     given = part.stop - part.start if isinstance(part, slice) else part.size
@@ -181,14 +182,17 @@ class _Feed:
         self.constants: list[onnx.TensorProto] = []
         self._prefix, self._name, self._kind = prefix, name, kind
 
-    def take(self, columns: slice) -> None:
-        """Give it columns of the observation."""
+    def take(self, columns: slice, shape: list[int]) -> None:
+        """Give it columns of the observation, in the shape that it has."""
         ends = (columns.start, columns.stop, 1, 1)
         names = [
             self._keep(what, np.array([end], np.int64))
             for what, end in zip(("starts", "ends", "axes", "steps"), ends, strict=True)
         ]
-        self._cast(self._node("Slice", _NAME, *names))
+        flat = self._node("Slice", _NAME, *names)
+        if len(shape) > 2 and all(size > 0 for size in shape[1:]):
+            flat = self._node("Reshape", flat, self._keep("shape", np.array([-1, *shape[1:]])))
+        self._cast(flat)
 
     def hold(self, value: np.ndarray, shape: list[int]) -> None:
         """Give it a constant, a row for each observation where its first axis is one of rows."""

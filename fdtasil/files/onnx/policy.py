@@ -23,6 +23,7 @@ if TYPE_CHECKING:
 
 __all__ = ["OnnxPolicy", "cannot_be_asked", "open_policy", "open_within_limits"]
 
+_WHOLE = ("tensor(int64)", "tensor(int32)")
 _FLOATS = ("tensor(float)", "tensor(double)", "tensor(float16)")
 
 
@@ -89,7 +90,8 @@ def open_policy(
     observation_size: int | None,
     action_size: int | None,
     output: str | None,
-) -> tuple[OnnxPolicy, int, int]:
+    choices: int = 0,
+) -> tuple[OnnxPolicy, int, int | None]:
     """Open a model, and ask it about a few observations.
 
     Args:
@@ -98,9 +100,10 @@ def open_policy(
         observation_size: n, used where the file leaves it open.
         action_size: m, which chooses among the outputs; or None.
         output: Name of the output that holds the actions, or None.
+        choices: How many choices an action is; where no scores go out, they themselves are taken.
 
     Returns:
-        The policy, and its n and m.
+        The policy, and its n and m; None for m where it answers with choices.
 
     Raises:
         ExpertError: If it can't be opened or asked, or its signature is not a policy's.
@@ -108,13 +111,15 @@ def open_policy(
     session = open_session(data, name)
     try:
         n = _observation_size(session, name, observation_size)
-        chosen = _choose_output(session, name, action_size, output)
+        chosen = _choose_output(session, name, action_size, output, choices)
         policy = _fastest(data, name, session, chosen, n)
         answers = policy(np.zeros((2, n), np.float32))
     except ExpertError:
         raise
     except Exception as error:  # onnxruntime has its own, and damaged names are no text
         raise cannot_be_asked(name, error) from error
+    if choices and answers.shape in ((2,) * (choices == 1), (2, choices)):
+        return policy, n, None
     if answers.ndim != 2 or len(answers) != 2:
         raise ExpertError(
             f"{name} answers 2 observations with shape {answers.shape}",
@@ -142,21 +147,23 @@ def open_within_limits(
     observation_size: int | None,
     action_size: int | None,
     output: str | None,
+    choices: int,
     straight: bool,
 ) -> None:
     """Do what `open_policy` does, in a process that may be killed for it.
 
     Args:
-        data: As there, like the next four.
+        data: As there, like the next five.
         name: As there.
         observation_size: As there.
         action_size: As there.
         output: As there.
+        choices: As there.
         straight: Whether it is also asked what a torch twin of it is compared on.
     """
     limit_process(len(data))
     warnings.simplefilter("ignore", FdtasilWarning)  # the parent opens it again, and warns
-    policy, n, _ = open_policy(data, name, observation_size, action_size, output)
+    policy, n, _ = open_policy(data, name, observation_size, action_size, output, choices)
     if straight:
         with suppress(Exception):  # what it raises, the parent will see
             policy(np.random.default_rng(0).standard_normal((64, n)).astype(np.float32))
@@ -230,7 +237,7 @@ def _wrapped(session: "Session", name: str, output: str, *parts: str) -> str:
 
 
 def _choose_output(
-    session: "Session", name: str, action_size: int | None, output: str | None
+    session: "Session", name: str, action_size: int | None, output: str | None, choices: int
 ) -> str:
     outputs = session.get_outputs()
     described = _described(outputs)
@@ -244,7 +251,8 @@ def _choose_output(
     fitting = [entry.name for entry in outputs if _could_be_actions(entry, rank, action_size)]
     # One number a row, without an axis of its own: what is wrong with it is said once it is asked.
     flat = [e.name for e in outputs if e.type in _FLOATS and len(e.shape) < rank]
-    fitting = fitting or flat[:1]
+    whole = [entry.name for entry in outputs if entry.type in _WHOLE] if choices else []
+    fitting = fitting or whole[:1] or flat[:1]
     if len(fitting) != 1:
         raise ExpertError(
             f"{name} has {len(fitting)} outputs that could be the actions: {described}",

@@ -1,0 +1,99 @@
+"""Demonstrations from arrays that somebody has, with neither rewards nor an expert."""
+
+from typing import Any
+
+import numpy as np
+
+from fdtasil.demonstrations.dataset import Dataset, check_dataset
+from fdtasil.demonstrations.states import Demonstrations
+from fdtasil.errors import SettingError
+
+__all__ = ["from_arrays"]
+
+
+def from_arrays(
+    observations: Any,
+    actions: Any,
+    *,
+    episode_ends: Any = None,
+    low: Any = None,
+    high: Any = None,
+    environment: str = "arrays",
+) -> Dataset:
+    """Make a dataset of plain arrays, which `distill(dataset=...)` learns from.
+
+    With an expert beside it, `distill(expert, dataset=...)` also asks the probes around its
+    states, without an environment.
+
+    Args:
+        observations: (N, n) states.
+        actions: (N, m) what the expert did there, in the environment's units.
+        episode_ends: (N,) booleans, true at the last state of each episode, or the number of
+            states up to each end, as Minari and D4RL have them. Left out, all are of one.
+        low: (m,) lower action bounds, or one number; left out, there are none.
+        high: (m,) upper bounds.
+        environment: What to call where they are from.
+
+    Raises:
+        SettingError: If the arrays do not go together, or are not finite.
+
+    Example:
+        >>> import numpy as np
+        >>> states = np.random.default_rng(0).standard_normal((6, 3))
+        >>> data = from_arrays(states, states[:, :1], episode_ends=[2, 6], low=-1, high=1)
+        >>> data.demonstrations.episode.tolist()
+        [0, 0, 1, 1, 1, 1]
+    """
+    rows, labels = _numbers("observations", observations), _numbers("actions", actions)
+    if rows.ndim != 2 or labels.ndim != 2 or len(rows) != len(labels) or not len(rows):
+        raise SettingError(
+            f"observations of shape {rows.shape} and actions of shape {labels.shape}",
+            "(N, n) and (N, m), a row for each state",
+            "reshape them; episodes stand one behind the other",
+        )
+    count, m = labels.shape
+    wide = np.full(m, np.inf)
+    least, most = _bound("low", low, -wide, m), _bound("high", high, wide, m)
+    states = Demonstrations(
+        rows,
+        labels,
+        _episodes(episode_ends, count),
+        np.zeros(count, np.int32),
+        labels.copy(),
+        np.zeros(count),
+        np.zeros(count, bool),
+    )
+    return check_dataset(Dataset(states, None, None, least, most, environment))
+
+
+def _numbers(name: str, given: Any) -> np.ndarray:
+    found = given.detach().cpu().numpy() if hasattr(given, "detach") else np.asarray(given)
+    if found.dtype.kind in "biuf" and not np.ma.is_masked(given):
+        return np.ascontiguousarray(found, np.float32)
+    raise SettingError(f"{name} of {found.dtype}", "an array of plain numbers", "convert them")
+
+
+def _bound(name: str, given: Any, usual: np.ndarray, m: int) -> np.ndarray:
+    try:
+        return np.broadcast_to(np.asarray(usual if given is None else given, np.float32), (m,))
+    except (TypeError, ValueError):
+        raise SettingError(
+            f"{name}={given!r}", f"{m} numbers, or one for all", f"write {name}=-1.0"
+        ) from None
+
+
+def _episodes(ends: Any, count: int) -> np.ndarray:
+    """Return (N,) int32, the episode of each state."""
+    if ends is None:
+        return np.zeros(count, np.int32)
+    given = np.asarray(ends)
+    if given.dtype == bool and given.shape == (count,):
+        given = np.flatnonzero(given) + 1
+    good = given.ndim == 1 and given.size > 0 and given.dtype.kind in "iu"
+    if not good or given[0] < 1 or given[-1] > count or not (np.diff(given) > 0).all():
+        raise SettingError(
+            f"episode_ends={np.array2string(given, threshold=6)}",
+            f"({count},) True at the last state of each episode, or growing numbers up to {count}",
+            "write for example episode_ends=[300, 600]",
+        )
+    return np.searchsorted(given, np.arange(count), side="right").astype(np.int32)
