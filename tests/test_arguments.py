@@ -101,7 +101,7 @@ def test_every_odd_value_works_or_is_refused(name, parameter, tmp_path, monkeypa
         (lambda: fdtasil.distill(linear, TOY, 0, fit={"steps": 3}), "fdtasil.Fit(steps=4000)"),
         (lambda: fdtasil.distill(linear, TOY, 0, force="False"), "write force=True, or leave it"),
         (lambda: fdtasil.distill(linear, TOY, 0, callback=Log), "fdtasil.Log("),
-        (lambda: fdtasil.distill(dataset=(np.ones((3, 5)), np.ones((3, 2)))), "Demonstrations("),
+        (lambda: fdtasil.distill(dataset=(np.ones((3, 5)), np.ones((3, 2)))), "from_arrays("),
     ],
 )
 def test_what_was_meant_is_said(call, next_step):

@@ -55,10 +55,11 @@ def test_the_shell_has_the_functions_arguments_and_defaults(name):
         "fit",
         "constraints",
     }
-    added = {"output", "inputs", "trust"}
+    added = {"output", "inputs", "trust", "env_kwargs", "reset_options"}
+    numbers = {"num_envs"}
     if name == "distill":
         added |= {"out", "baseline", "log_formats"} | SETTINGS
-    assert set(command) - set(function) <= added
+    assert set(command) - set(function) <= added | numbers
     for argument in set(function) & set(command):
         default = function[argument].default
         # A shell's run is always saved; one that goes on stays on its device.
@@ -66,6 +67,24 @@ def test_the_shell_has_the_functions_arguments_and_defaults(name):
             assert command[argument].default in (default, str(default))
     for argument in added - {"out", "baseline", "log_formats"}:
         assert command[argument].default is None
+
+
+def test_the_environment_is_made_and_reset_as_flags_say(called, inside, tmp_path):
+    options = ["--env-kwargs", '{"wall": 0.9}', "--reset-options", '{"a": [1]}', "--num-envs", "2"]
+    assert inside("distill", "e.onnx", TOY, *options, cwd=tmp_path).returncode == 130
+    assert called["env"] == fdtasil.Environment(TOY, {"wall": 0.9}, {"a": [1]}, 2)
+    for text in ("{", "[1]", "3"):
+        done = inside("distill", "e.onnx", TOY, "--env-kwargs", text, cwd=tmp_path)
+        assert done.returncode == 2
+        assert "a JSON object" in done.stderr
+
+
+def test_another_gravity_is_judged_otherwise(expert, inside):
+    line = ["evaluate", expert, TOY, "--expert", expert, "--episodes", "2", "--horizon", "30"]
+    made = inside(*line, "--env-kwargs", '{"wall": 1.01}')
+    assert made.returncode == 0, made.stderr
+    assert "survival 1.00" not in made.stdout
+    assert "survival 1.00" in inside(*line).stdout
 
 
 @pytest.fixture

@@ -1,11 +1,14 @@
 """Stored answers train other students without a question; students may see less."""
 
+import importlib
 import io
 import json
 
 import numpy as np
 import pytest
-from conftest import QUICK, TOY, mlp_onnx
+import torch
+from conftest import GAIN, QUICK, TOY, mlp_onnx
+from toy_forms import ACTIONS, OBSERVATIONS, in_form
 
 import fdtasil
 from fdtasil import Fit, Mlp
@@ -237,3 +240,88 @@ def test_a_result_shows_itself_in_a_few_lines(linear):
     shown = repr(fdtasil.distill(linear, TOY, 2, **QUICK))
     assert "40 states, probes adaptive:2" in shown
     assert len(shown.splitlines()) < 10
+
+
+@pytest.fixture
+def arrays():
+    states = np.random.default_rng(0).standard_normal((40, 5))
+    return states, states @ GAIN.T.astype(np.float64)
+
+
+def test_a_student_of_plain_arrays_and_an_expert_without_an_environment(arrays, linear):
+    """Nothing is recorded, nothing is compared: only the probes around the states are asked."""
+    states, actions = arrays
+    data = fdtasil.from_arrays(states, actions, episode_ends=[15, 40], low=-5, high=5)
+    assert data.demonstrations.episodes == 2
+    assert data.high.tolist() == [5, 5]
+    result = fdtasil.distill(linear, dataset=data, probes=4, fit=fdtasil.Fit(steps=20))
+    assert result.queries["probe"] == 160
+    assert result.queries["act"] == result.queries["label"] == 0
+    assert result.evaluation is None
+    cloned = fdtasil.distill(dataset=data, fit=fdtasil.Fit(steps=20), probes=0)
+    assert sum(cloned.queries.values()) == 0
+
+
+def test_ends_of_episodes_as_others_have_them(arrays):
+    flags = np.zeros(40, bool)
+    flags[[14, 39]] = True
+    for ends in (flags, [15, 40], np.array([15, 40]), [15]):
+        found = fdtasil.from_arrays(*arrays, episode_ends=ends).demonstrations.episode
+        assert found.tolist() == [0] * 15 + [1] * 25
+    assert fdtasil.from_arrays(*map(torch.from_numpy, arrays)).demonstrations.episodes == 1
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"observations": np.zeros((3, 5))},
+        {"actions": np.zeros(40)},
+        {"observations": np.full((40, 5), np.nan)},
+        {"observations": [["a"] * 5] * 40},
+        {"episode_ends": [0, 40]},
+        {"episode_ends": [20, 10]},
+        {"episode_ends": [41]},
+        {"episode_ends": "end"},
+        {"low": [1, 2, 3]},
+        {"low": 1, "high": 0},
+    ],
+)
+def test_arrays_that_do_not_go_together(arrays, change):
+    given = {"observations": arrays[0], "actions": arrays[1], **change}
+    with pytest.raises(SettingError):
+        fdtasil.from_arrays(given.pop("observations"), given.pop("actions"), **given)
+
+
+def test_a_minari_dataset_of_dictionaries_and_choices_with_its_expert(tmp_path, monkeypatch):
+    """Somebody's recordings and who made them, without an environment."""
+    minari = pytest.importorskip("minari")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    buffer = importlib.import_module("minari.data_collector").EpisodeBuffer
+    form = OBSERVATIONS["nested"]
+    expert = in_form(lambda rows: np.asarray(rows, np.float32) @ GAIN.T, "nested", "choice")
+    plain = np.random.default_rng(0).standard_normal((2, 13, 5))
+    episodes = [
+        buffer(
+            id=number,
+            observations=form.of(rows),
+            actions=expert(form.of(rows[:12])),
+            rewards=[0.0] * 12,
+            terminations=[False] * 12,
+            truncations=[False] * 11 + [True],
+            infos={},
+        )
+        for number, rows in enumerate(plain)
+    ]
+    spaces = {
+        "observation_space": form.space,
+        "action_space": ACTIONS["choice"].space,
+        "requirements": [],
+    }
+    minari.create_dataset_from_buffers("toy/nested-v0", episodes, **spaces)
+    data = fdtasil.from_minari("toy/nested-v0")
+    assert data.spaces.actions.choices == ((0, 4),)
+    assert data.demonstrations.actions.sum(1) == pytest.approx(0, abs=1e-6)
+    result = fdtasil.distill(expert, dataset=data, probes=3, fit=fdtasil.Fit(steps=20))
+    assert result.queries["probe"] > 0
+    seen = data.spaces.observations.value(data.demonstrations.observations[0])
+    assert result.student.predict(seen)[0] in (1, 2, 3, 4)

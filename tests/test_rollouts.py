@@ -4,7 +4,6 @@ import gymnasium
 import numpy as np
 import pytest
 from conftest import GAIN, TOY
-from gymnasium.spaces import Box
 from toy_environments import Integrator
 
 from fdtasil.errors import EnvironmentFault, FdtasilWarning, SettingError
