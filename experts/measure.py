@@ -15,7 +15,7 @@ from pathlib import Path
 
 import torch
 
-from fdtasil.experts.load import load_expert
+from fdtasil.experts.load import expert_in
 from fdtasil.rollouts.behaviours import follow
 from fdtasil.rollouts.environments import EnvironmentPool
 from fdtasil.rollouts.rollout import rollout
@@ -30,7 +30,7 @@ EPISODES = 100
 def measure(path: Path, environment: str, horizon: int, seed: int) -> dict[str, float]:
     """Return mean and deviation of 100 returns, and the share of episodes that did not fall."""
     with EnvironmentPool(environment) as pool:
-        expert = load_expert(path, pool.boxes.observation_size, pool.boxes.action_size)
+        expert = expert_in(path, pool)
         seeds = episode_seeds(seed, "measure", 0, EPISODES)
         episodes = rollout(follow(expert.policy("evaluate")), pool, seeds, horizon)
     return {

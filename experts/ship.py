@@ -2,6 +2,7 @@
 
     python experts/ship.py runs/experts/HalfCheetah-v5
     python experts/ship.py Walker2d-v5.zip --environment Walker2d-v5 --steps 550000
+    python experts/ship.py best.zip --environment CartPole-v1 --name CartPole-v1-PPO --steps 100000
 
 The source is a folder of train.py, or a stable-baselines3 zip (read without unpickling).
 """
@@ -103,6 +104,7 @@ def main() -> None:
     parser.add_argument("source", type=Path)
     parser.add_argument("--environment", help="of a zip, which does not say")
     parser.add_argument("--steps", type=int, help="environment steps that a zip was trained for")
+    parser.add_argument("--name", help="of the expert; left out, the environment's")
     arguments = parser.parse_args()
     torch.set_num_threads(1)
     source = arguments.source
@@ -110,7 +112,8 @@ def main() -> None:
         module, entry = from_folder(source)
     else:
         module, entry = from_zip(source, arguments.environment, arguments.steps)
-    name = environment = entry["environment"]
+    environment = entry["environment"]
+    name = arguments.name or environment
     data = export_module(module, visited_states(module, environment), {"environment": environment})
     write_bytes(HERE / f"{name}.onnx", data)
     if (source / "curve.png").exists():
