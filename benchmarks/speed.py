@@ -46,6 +46,7 @@ STEPS = 150
 ROUNDS = 7
 GPU_ROUNDS = 3
 BATCHES = (64, 256, 1024, 4096)
+TOGETHER = 512  # environments in one vector environment
 
 
 def cells(quick: bool) -> list[Cell]:
@@ -61,7 +62,8 @@ def cells(quick: bool) -> list[Cell]:
     if quick:
         experts = experts[:1]
     found += [{"what": "asking", "expert": name} for name in experts]
-    return found + [{"what": "stepping", "expert": name} for name in experts]
+    found += [{"what": "stepping", "expert": name} for name in experts]
+    return found + [{"what": "stepping together", "expert": experts[0], "count": TOGETHER}]
 
 
 def measure(cell: Cell, device: str) -> dict[str, Any]:
@@ -202,6 +204,28 @@ def _stepping(cell: Cell) -> dict[str, Any]:
     return {"seconds": {"ours": ours, "bare": bare}}
 
 
+def _stepping_together(cell: Cell) -> dict[str, Any]:
+    """Seconds of a rollout of an episode in each of many environments, and of their steps."""
+    count, ours, bare = cell["count"], [], []
+    vector = gymnasium.make_vec(cell["expert"], count, vectorization_mode="sync")
+    seeds = list(range(count))
+    with EnvironmentPool(vector) as pool:
+        act = np.zeros((1, pool.boxes.action_size), np.float32)
+        idle = follow(lambda rows: np.repeat(act, len(rows), axis=0))
+        still = np.repeat(act, count, axis=0)
+        for _ in range(ROUNDS):
+            bare.append(_seconds(lambda: _bare_together(vector, seeds, still)))
+            ours.append(_seconds(lambda: rollout(idle, pool, seeds, 20)))
+    vector.close()
+    return {"seconds": {"ours": ours, "bare": bare}}
+
+
+def _bare_together(vector: gymnasium.vector.VectorEnv, seeds: list[int], still: Any) -> None:
+    vector.reset(seed=seeds)  # pyright: ignore[reportArgumentType]
+    for _ in range(20):
+        vector.step(still)
+
+
 def _bare(environment: gymnasium.Env, actions: np.ndarray) -> None:
     for episode, sequence in enumerate(actions):
         environment.reset(seed=episode)
@@ -225,6 +249,7 @@ _MEASURES = {
     "step on a GPU": _step_on_a_gpu,
     "asking": _asking,
     "stepping": _stepping,
+    "stepping together": _stepping_together,
 }
 
 
@@ -251,10 +276,9 @@ def draw(rows: Sequence[Row]) -> dict[str, bytes]:
             rates = result["rows_per_second"]
             lines.append(_line(f"rows, {cell['expert']}", "session", rates["ours"], rates["bare"]))
         else:
-            times = result["seconds"]
-            lines.append(
-                _line(f"rollout, {cell['expert']}", "env.step", times["ours"], times["bare"])
-            )
+            times, count = result["seconds"], cell.get("count", 1)
+            what = f"rollout, {cell['expert']}" + f", {count} together" * (count > 1)
+            lines.append(_line(what, "env.step", times["ours"], times["bare"]))
     text = table(["what", "of", "ratio, minimum", "median"], lines)
     return {"speed.md": f"{text}\nOne thread.\n".encode()}
 

@@ -14,7 +14,7 @@ pytestmark = pytest.mark.usefixtures("no_pictures")
 
 EXPERTS = {
     "smooth": lambda x: np.tanh(x @ GAIN.T),
-    "steps": lambda x: np.round(20 * (x @ GAIN.T) % 1) / 2,
+    "steps": lambda x: np.floor(8 * (20 * (x @ GAIN.T) % 1)) / 16,
 }
 
 
@@ -40,6 +40,21 @@ def test_an_open_source_is_completed(regime, stencil, radius):
     rows = (1 if stencil == "forward" else 2) * 3 * len(result.demonstrations)
     assert result.queries["probe"] == rows
     assert result.report["predicted_queries"]["probe"] == rows
+
+
+@pytest.mark.parametrize("dead_zone", [0.0, 0.1])
+def test_a_law_that_switches_is_asked_far_and_wide(dead_zone):
+    """Near a state nothing changes: what is learnt there is nothing, and loud where it is wrong."""
+
+    def relay(x):
+        force = x @ GAIN.T
+        return np.sign(force) * (np.abs(force) > dead_zone)
+
+    result = fdtasil.distill(relay, TOY, 3, **QUICK)
+    assert result.report["calibration"]["switches"]
+    assert result.report["radius"] == [0.2, 2.0]
+    assert ",both," in result.report["probes"]
+    assert "radius=0.4," in fdtasil.distill(relay, TOY, "3,radius=0.4", **QUICK).report["probes"]
 
 
 def test_what_the_caller_says_stays():

@@ -1,5 +1,8 @@
 """The student: bounds and normaliser inside, its files, its ONNX."""
 
+import subprocess
+import sys
+
 import numpy as np
 import onnx
 import onnxruntime
@@ -8,8 +11,11 @@ import torch
 
 from fdtasil.errors import ExportError, SettingError, StorageError
 from fdtasil.files.onnx.export import export_module
+from fdtasil.probes.scales import measure_scales
 from fdtasil.seeding import torch_generator
 from fdtasil.student.architectures import ACTIVATIONS, Mlp
+from fdtasil.student.exports import export
+from fdtasil.student.plain import PlainPolicy
 from fdtasil.student.policy import Student
 
 
@@ -156,3 +162,39 @@ def test_a_module_that_onnx_can_not_hold_is_named(rows):
 def test_a_wrong_shape_is_refused(wrong):
     with pytest.raises(SettingError):
         make(**wrong)
+
+
+@pytest.mark.parametrize("activation", ACTIVATIONS)
+@pytest.mark.parametrize("bounds", ["both", "none", "one"])
+def test_a_robot_needs_numpy_alone(activation, bounds, tmp_path):
+    """The file that is exported answers in a process where nothing else can be imported."""
+    student = make((16, 8), activation)
+    if bounds != "both":
+        low, high = np.float32([-1, -1]), np.float32([1, 1])
+        low[: 1 if bounds == "one" else 2], high[: 1 if bounds == "one" else 2] = -np.inf, np.inf
+        scales = measure_scales(np.random.default_rng(0).normal(3, 2, (50, 2)))
+        network, random = Mlp((16, 8), activation), torch_generator(0)
+        student = Student(network, np.zeros(3), np.ones(3), low, high, random, scales)
+    rows = np.random.default_rng(0).standard_normal((50, 3)).astype(np.float32)
+    for name in ("student.py", "student.safetensors"):
+        (tmp_path / name).write_bytes(export(student, rows, {}, name))
+    np.save(tmp_path / "rows.npy", rows)
+    script = (
+        "import sys, time, numpy as np\n"
+        "sys.modules.update(dict.fromkeys(('torch', 'onnxruntime', 'fdtasil', 'safetensors')))\n"
+        "start = time.perf_counter()\n"
+        "from student import PlainPolicy\n"
+        "assert time.perf_counter() - start < 0.2\n"
+        "np.save('answers.npy', PlainPolicy.load()(np.load('rows.npy')))\n"
+    )
+    subprocess.run([sys.executable, "-c", script], cwd=tmp_path, check=True)
+    expected = student.act(rows)
+    assert np.load(tmp_path / "answers.npy") == pytest.approx(expected, abs=1e-5)
+
+
+def test_weights_that_are_none(tmp_path):
+    good = make((8,)).to_bytes()
+    for data in (b"", b"x" * 100, good[:50], good.replace(b"fdtasil", b"fdtaslo")):
+        (tmp_path / "s.safetensors").write_bytes(data)
+        with pytest.raises(ValueError, match="not the weights"):
+            PlainPolicy.load(tmp_path / "s.safetensors")

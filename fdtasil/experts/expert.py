@@ -97,6 +97,7 @@ class Expert:
         workers: Who answer chunks side by side instead of `answer`, or None; copies share them.
         queries: Rows asked so far, by purpose.
         silence: Where it had no answer; copies share it as they share the queries.
+        seconds: What one query took when the gate asked, by "alone"; copies share it.
         own_form: Whether it takes observations as an environment has them, in a batch:
             dictionaries, stacks of frames; others take flat rows.
         spaces: Those that it was opened in, where they are no plain boxes; see `structure.py`.
@@ -124,6 +125,7 @@ class Expert:
     jacobian: Callable[[np.ndarray], np.ndarray] | None = None
     memory: Memory | None = None
     takes: tuple[int, ...] | None = None
+    seconds: dict[str, float] = field(default_factory=dict)
     own_form: bool = False
     spaces: Spaces | None = None
 

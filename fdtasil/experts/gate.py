@@ -94,6 +94,7 @@ def _examine(
         return [Finding("answers", error.found, error)]
     # The first query may start workers, and any may meet a busy machine: the quickest counts.
     announce(float(np.diff(times).min()) / len(observations))
+    expert.seconds["alone"] = (times[3] - times[2]) / len(observations)
     none = has_none(answers) | has_none(again) | has_none(alone)
     measured = f"{answers.shape[1]} finite numbers for each observation"
     if none.any():

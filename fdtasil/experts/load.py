@@ -242,7 +242,7 @@ def _open_again(file: str | Path, hints: Hints, sha256: str | None) -> Policy:
 
 
 def _from_expert(expert: Expert, hints: Hints) -> Expert:
-    return dataclasses.replace(expert, queries=Counter(), silence=Silence())
+    return dataclasses.replace(expert, queries=Counter(), silence=Silence(), seconds={})
 
 
 def _from_http(url: str, hints: Hints) -> Expert:

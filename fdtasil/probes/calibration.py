@@ -78,13 +78,15 @@ class Calibration:
             radius, where nothing but rounding and noise is left of them.
         radius: Suggested, in standard deviations of each coordinate.
         stencil: Suggested, "forward" or "central".
-        match: Suggested where the law is steep, "both"; else None.
+        match: Suggested where the law is steep or switches, "both"; else None.
         similarity: Secant similarity at each radius and a quarter of it; the first is NaN.
         change: Root mean square change of an action at each radius.
         radii: The radii, ascending.
         queries: Rows asked.
         no_answer: Radius, and share of the states moved so far where the expert has no answer;
             empty where it has one everywhere.
+        switches: Whether each action has few values and nothing between them, as a choice or a
+            relay has. Near a state nothing changes then: it is asked as far as "fresh" asks.
     """
 
     regime: Literal["smooth", "noisy", "steps"]
@@ -97,10 +99,12 @@ class Calibration:
     queries: int
     match: Match | None = None
     no_answer: tuple[tuple[float, float], ...] = ()
+    switches: bool = False
 
     def complete(self, probes: Probes) -> Probes:
         """Return the source with what it leaves open filled in; warn of a radius that misleads."""
-        radius = self.radius if probes.radius is None else probes.radius
+        usual = WIDE if self.switches else self.radius
+        radius = usual if probes.radius is None else probes.radius
         if radius == "wide":
             nearest = self._nearest()
             radius = max(WIDE[0], nearest), max(WIDE[1], nearest)
@@ -196,6 +200,7 @@ def calibrate(
     regime, radius, stencil = _judge(similarity, radii[1:], usual)
     radius = min(radius, float(radii[-1]))  # where it still answers
     steep = np.interp(np.log(radius), np.log(radii), change) > _STEEP * centres.std(axis=0).mean()
+    switches = _switches(values, centres)
     return Calibration(
         regime,
         floor,
@@ -205,9 +210,21 @@ def calibrate(
         tuple(change.tolist()),
         tuple(radii.tolist()),
         ladder.queries,
-        "both" if steep else None,
+        "both" if steep or switches else None,
         shares,
+        switches,
     )
+
+
+def _switches(values: np.ndarray, centres: np.ndarray) -> bool:
+    """Whether each of the actions in (rays, radii, 2, m) values has few of them."""
+    m = centres.shape[1]
+    said = np.concatenate([values.reshape(-1, m), centres])
+    counts = [len(np.unique(action)) for action in said.T]
+    return max(counts) <= _FEW_VALUES and min(counts) > 1
+
+
+_FEW_VALUES = 3  # a relay has two, with a dead zone three
 
 
 def _no_answer(values: np.ndarray, radii: np.ndarray) -> tuple[tuple[float, float], ...]:

@@ -23,6 +23,7 @@ from fdtasil.probes.spread import SpreadLike
 from fdtasil.progress import Progress
 from fdtasil.results.distilled import Distilled, write_run
 from fdtasil.results.evaluation import Constraints, Evaluation, check_constraints, evaluate_pair
+from fdtasil.results.size import size_of_expert, size_of_student
 from fdtasil.rollouts.behaviours import follow, follow_answers
 from fdtasil.rollouts.environments import EnvironmentLike, EnvironmentPool, resolve_horizon
 from fdtasil.rollouts.episodes import Episodes
@@ -374,9 +375,13 @@ def _complete(
         if subject.expert is not None:
             shares, ended = no_answer(checkpoints.account), lesson.collected.counts
             warn_of_silence(shares, subject.expert.silence.reason, ended["given_up_episodes"])
+    sizes = {"student": size_of_student(student)}
+    if subject.expert is not None:
+        sizes["expert"] = size_of_expert(subject.expert, run.observation_size)
     report = report_of(
         run,
         evaluation,
+        sizes,
         lesson,
         trained.steps,
         checkpoints,

@@ -1,11 +1,13 @@
 """What a run says of itself: `config.json`, `report.json`, and the warnings on the way."""
 
 import platform
+from collections.abc import Mapping
 from dataclasses import replace
 from importlib.metadata import version
 from typing import Any
 
 from fdtasil.results.evaluation import Evaluation
+from fdtasil.results.size import Size
 from fdtasil.run.account import Account
 from fdtasil.run.checkpoints import Checkpoints
 from fdtasil.run.configuration import Configuration
@@ -44,6 +46,7 @@ def _held(run: Configuration) -> list[str]:
 def report_of(
     run: Configuration,
     evaluation: Evaluation | None,
+    sizes: Mapping[str, Size],
     lesson: Lesson,
     steps: int,
     checkpoints: Checkpoints,
@@ -56,6 +59,7 @@ def report_of(
     Args:
         run: The configuration.
         evaluation: Student against expert, or None where they could not be compared.
+        sizes: Of student and expert, by these names.
         lesson: What the last round learnt from.
         steps: Gradient steps of all rounds.
         checkpoints: Know the account and the calibration.
@@ -98,6 +102,7 @@ def report_of(
         "frozen_coordinates": int((~lesson.scales.live).sum()),
         "held": _held(run),
         **{name: lesson.collected.counts.get(name, 0) for name in counts},
+        "size": {name: size.to_json() for name, size in sizes.items()},
         "steps": steps,
         "train_seconds": round(train_seconds, 2),
         "matmul_precision": matmul_precision,

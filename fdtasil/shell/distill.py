@@ -20,6 +20,7 @@ from fdtasil.files.run_format import CHECKPOINTS, COMMAND, check_free, stamped, 
 from fdtasil.files.storage import is_written, remove_file, remove_if_empty, write_bytes
 from fdtasil.results.distilled import Distilled
 from fdtasil.results.evaluation import Evaluation, interval_text, score_text
+from fdtasil.results.size import size_text
 from fdtasil.run.pipeline import distill
 from fdtasil.shell.beside import evaluated_beside
 from fdtasil.shell.call import ENVIRONMENT_FLAGS, distil
@@ -65,6 +66,8 @@ def _distill(baseline: bool, **arguments: Any) -> None:
         print(_side_by_side(result, cloning()))
     chosen = result.report.get("probes_chosen")
     print(f"queries: {rows_text(result.queries)}" + (f" ({shown(chosen)})" if chosen else ""))
+    sizes = {name: size_text(size) for name, size in result.report["size"].items()}
+    print("; ".join(f"{name}: {text}" for name, text in sizes.items()))
     print(f"saved in {out}: student.onnx, student.safetensors, report.json, figures/, ...")
 
 

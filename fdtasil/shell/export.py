@@ -19,6 +19,7 @@ def command(run: RunFolder, file: OutFile) -> None:
     Args:
         run: Folder of a finished run.
         file: Ends with .onnx, .safetensors, .c (C99 without malloc; compiled and compared with the
-            student where there is a compiler) or .h, its header.
+            student where there is a compiler), .h (its header) or .py (what answers with numpy
+            alone, from the .safetensors).
     """
     print(f"written: {Distilled.load(run).export(file)}")

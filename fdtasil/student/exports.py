@@ -8,6 +8,7 @@ import numpy as np
 from fdtasil.checks import check_choice
 from fdtasil.errors import ExportError, SettingError
 from fdtasil.files.onnx.export import check_finite, export_module
+from fdtasil.student import plain
 from fdtasil.student.c_source import c_header, c_source, check_parity
 from fdtasil.student.own_form import own_form
 from fdtasil.student.plain import PlainPolicy
@@ -42,20 +43,20 @@ def _safetensors(student: Student, states: np.ndarray, metadata: Mapping[str, st
 
 def _plain(student: Student) -> PlainPolicy:
     check_finite(student)
-    plain = student.plain
-    if plain is None:
+    found = student.plain
+    if found is None:
         raise ExportError(
-            f"a student of {type(student.architecture).__name__} as C",
+            f"a student of {type(student.architecture).__name__} without torch",
             "fdtasil.Mlp, on the CPU",
             "export it as .onnx",
         )
-    return plain
+    return found
 
 
 def _c(student: Student, states: np.ndarray, metadata: Mapping[str, str]) -> bytes:
-    plain = _plain(student)
-    source = c_source(plain, metadata)
-    check_parity(source, plain, states)
+    policy = _plain(student)
+    source = c_source(policy, metadata)
+    check_parity(source, policy, states)
     return source.encode()
 
 
@@ -63,11 +64,17 @@ def _h(student: Student, states: np.ndarray, metadata: Mapping[str, str]) -> byt
     return c_header(_plain(student)).encode()
 
 
+def _py(student: Student, states: np.ndarray, metadata: Mapping[str, str]) -> bytes:
+    _plain(student)  # who is no such network needs torch
+    return Path(plain.__file__).read_bytes()
+
+
 EXPORTS: dict[str, Writer] = {
     ".onnx": _onnx,
     ".safetensors": _safetensors,
     ".c": _c,
     ".h": _h,
+    ".py": _py,
 }
 """Every target by the suffix of its file."""
 

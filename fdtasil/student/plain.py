@@ -1,7 +1,18 @@
-"""A student in numpy alone, for one observation in microseconds and for machines without torch."""
+"""A student in numpy alone, for one observation in microseconds and for machines without torch.
 
+This file imports nothing else, and is a program by itself: `fdtasil export RUN student.py` writes
+it out for a robot. There:
+
+    from student import PlainPolicy
+
+    policy = PlainPolicy.load("student.safetensors")
+    action = policy(observation)  # (n,) -> (m,), or (B, n) -> (B, m)
+"""
+
+import json
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -65,6 +76,8 @@ class PlainPolicy:
         bounded: (m,) bool, the actions that are squashed.
         centre: (m,) middle of each action.
         half: (m,) half the range of each.
+        choices: Start and end of the scores of each choice, and its first value; () where actions
+            are numbers.
     """
 
     mean: np.ndarray
@@ -74,6 +87,38 @@ class PlainPolicy:
     bounded: np.ndarray
     centre: np.ndarray
     half: np.ndarray
+    choices: Sequence[tuple[int, int, int]] = ()
+
+    @classmethod
+    def load(cls, path: str | Path = "student.safetensors") -> "PlainPolicy":
+        """Read the weights that fdtasil wrote.
+
+        Raises:
+            ValueError: If they are none.
+        """
+        tensors, about = _safetensors(Path(path).read_bytes())
+        names = sorted(
+            {name.rpartition(".")[0] for name in tensors if name.startswith("network.")},
+            key=lambda name: int(name.rpartition(".")[2]),
+        )
+        layers = [(tensors[f"{name}.weight"], tensors[f"{name}.bias"]) for name in names]
+        low, high = tensors["low"], tensors["high"]
+        bounded = np.isfinite(low) & np.isfinite(high)
+        with np.errstate(invalid="ignore"):  # of infinite bounds, whose middles are stored
+            centre = tensors.get("_centre", (high + low) / 2)
+            half = tensors.get("_half", (high - low) / 2)
+        bend = about["student"].get("activation", "gelu")
+        if bend not in PLAIN:
+            raise ValueError(f"the activation {bend!r}, where one of {', '.join(PLAIN)} is known")
+        parts = about.get("spaces", {}).get("actions", [])
+        plain = tensors["mean"], tensors["scale"], layers, bend, bounded, centre, half
+        return cls(*plain, _choices(parts))
+
+    def choose(self, observation: np.ndarray) -> np.ndarray:
+        """(n,) or (B, n) raw observations -> (c,) or (B, c), the best of each choice."""
+        scores = self(observation)
+        best = [first + scores[..., a:b].argmax(axis=-1) for a, b, first in self.choices]
+        return np.stack(best, axis=-1)
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
         """(n,) or (B, n) raw observations -> (m,) or (B, m) float32 actions."""
@@ -87,3 +132,35 @@ class PlainPolicy:
         value = value @ weights.T + biases
         squashed = np.where(self.bounded, np.tanh(value), value)
         return (self.centre + self.half * squashed).astype(np.float32)
+
+
+def _safetensors(data: bytes) -> tuple[dict[str, np.ndarray], dict]:
+    """Return the tensors of a file by name, and what it says of itself.
+
+    Raises:
+        ValueError: If it is no file of a student.
+    """
+    size = int.from_bytes(data[:8], "little")
+    try:
+        header = json.loads(data[8 : 8 + size])
+        about = json.loads(header.pop("__metadata__")["fdtasil"])
+        body, found = memoryview(data)[8 + size :], {}
+        for name, entry in header.items():
+            start, stop = entry["data_offsets"]
+            kind = {"F32": np.float32, "BOOL": np.bool_}[entry["dtype"]]
+            found[name] = np.frombuffer(body[start:stop], kind).reshape(entry["shape"])
+        return found, about
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
+        raise ValueError(f"not the weights of a student: {type(error).__name__}") from error
+
+
+def _choices(parts: Sequence[dict]) -> list[tuple[int, int, int]]:
+    """Return start, end and first value of each choice of an action's parts."""
+    found, start = [], 0
+    for part in parts:
+        for size, first in zip(part["sizes"], part["first"], strict=True):
+            found.append((start, start + size, first))
+            start += size
+        if not part["sizes"]:
+            start += int(np.prod(part["shape"]))
+    return found
