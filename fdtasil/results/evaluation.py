@@ -12,6 +12,7 @@ from fdtasil.experts.expert import Expert
 from fdtasil.files.plain import from_plain, to_plain
 from fdtasil.probes.scales import measure_scales
 from fdtasil.progress import Progress
+from fdtasil.results.smoothness import smoothness_of
 from fdtasil.rollouts.behaviours import Behaviour, has_none, random_behaviour
 from fdtasil.rollouts.environments import EnvironmentPool
 from fdtasil.rollouts.episodes import Episodes
@@ -67,6 +68,10 @@ class Evaluation:
             and the student violated it.
         agreement: Where actions are choices, the share of the student's own states at which it
             chooses as the expert does; else None.
+        roughness: How much the student's actions change from step to step; see `Smoothness`.
+        expert_roughness: The same for the expert.
+        high_frequency: Share of the power of the student's actions that is fast.
+        expert_high_frequency: The same for the expert.
     """
 
     episodes: int
@@ -86,6 +91,10 @@ class Evaluation:
     physics_resets: int = 0
     violations: tuple[tuple[str, float, float], ...] = ()
     agreement: float | None = None
+    roughness: float | None = None
+    expert_roughness: float | None = None
+    high_frequency: float | None = None
+    expert_high_frequency: float | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Return the evaluation as plain JSON values."""
@@ -113,8 +122,14 @@ class Evaluation:
             f"  student           {student}\n"
             f"  normalised return {share}\n"
             f"  action error      {self.action_error:10.3f}   on the student's own states"
-            f"{same}{kept}"
+            f"{same}{self._rough()}{kept}"
         )
+
+    def _rough(self) -> str:
+        if self.roughness is None or self.expert_roughness is None:
+            return ""
+        told = f"{self.roughness:10.3f}   expert {self.expert_roughness:.3f}, change in a step"
+        return f"\n  roughness         {told}"
 
 
 def evaluate_pair(
@@ -172,6 +187,8 @@ def evaluate_pair(
     said = expert.ask(visited, "evaluate")
     heard = ~has_none(said)  # where the expert has an answer
     distance = np.linalg.norm(acted[heard] - said[heard], axis=1)
+    our_smoothness = smoothness_of(student_episodes, pool)
+    their_smoothness = smoothness_of(expert_episodes, pool)
     return Evaluation(
         episodes=len(seeds),
         horizon=horizon,
@@ -193,6 +210,10 @@ def evaluate_pair(
             for name, constraint in (constraints or {}).items()
         ),
         agreement=_agreement(pool.spaces.actions, acted[heard], said[heard]),
+        roughness=our_smoothness.roughness,
+        expert_roughness=their_smoothness.roughness,
+        high_frequency=our_smoothness.high_frequency,
+        expert_high_frequency=their_smoothness.high_frequency,
     )
 
 

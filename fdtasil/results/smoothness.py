@@ -1,0 +1,60 @@
+"""How rough the actions of an episode are: what wears a machine out, and returns do not show."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from fdtasil.rollouts.environments import EnvironmentPool
+from fdtasil.rollouts.episodes import Episodes
+
+__all__ = ["Smoothness", "smoothness_of"]
+
+_LEAST = 16  # steps of an episode whose spectrum is looked at
+
+
+class Smoothness(NamedTuple):
+    """How rough actions are.
+
+    Attributes:
+        roughness: Mean change of an action from one step to the next: of bounded actions in units
+            of half their range, of others of their deviation, of choices the share that change.
+            None where no episode has two steps.
+        high_frequency: Share of the power of the actions' changes about their mean that is faster
+            than half of the fastest that the time step allows (a period of four steps); None for
+            choices, for constant actions, and for episodes of fewer than 16 steps.
+    """
+
+    roughness: float | None
+    high_frequency: float | None
+
+
+def smoothness_of(episodes: Episodes, pool: EnvironmentPool) -> Smoothness:
+    """Measure the actions of some episodes, as the environment took them."""
+    chosen, m = pool.spaces.actions, pool.boxes.action_size
+    flat, _ = pool.bounds.put_inside(episodes.actions.reshape(-1, m))
+    acted = flat.reshape(episodes.actions.shape).astype(np.float64)
+    both = episodes.valid[:, 1:] & episodes.valid[:, :-1]
+    if not both.any():
+        return Smoothness(None, None)
+    if chosen.choices:
+        best = chosen.best(acted.reshape(-1, m)).reshape(*episodes.valid.shape, -1)
+        return Smoothness(float((best[:, 1:] != best[:, :-1])[both].mean()), None)
+    boxes = pool.boxes
+    deviation = acted[episodes.valid].std(axis=0)
+    with np.errstate(invalid="ignore"):  # of infinite bounds, which are not chosen
+        units = np.where(boxes.bounded, (boxes.high - boxes.low) / 2, deviation)
+    scaled = acted / np.where(units > 0, units, 1.0)
+    rough = float(np.abs(np.diff(scaled, axis=1))[both].mean())
+    return Smoothness(rough, _high_frequency(scaled, episodes.lengths))
+
+
+def _high_frequency(actions: np.ndarray, lengths: np.ndarray) -> float | None:
+    fast = total = 0.0
+    for episode, length in zip(actions, lengths, strict=True):
+        if length < _LEAST:
+            continue
+        mine = episode[:length]
+        power = np.abs(np.fft.rfft(mine - mine.mean(axis=0), axis=0)) ** 2
+        fast += float(power[np.fft.rfftfreq(length) > 0.25].sum())
+        total += float(power.sum())
+    return fast / total if total > 0 else None
