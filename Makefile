@@ -4,11 +4,21 @@ BIN = .venv/bin
 # One thread per process: several at once on few cores are many times slower otherwise.
 export OMP_NUM_THREADS = 1
 
-.PHONY: demo test torture lint types wheel check clean
+.PHONY: demo film test torture lint types wheel check clean
 
 demo: .venv/ready
 	$(BIN)/fdtasil distill experts/HalfCheetah-v5.onnx HalfCheetah-v5 \
 		--episodes 1 --horizon 300 --baseline --out runs/demo
+
+# Expert, cloning and student from one trajectory, side by side.
+film: .venv/ready
+	$(BIN)/fdtasil distill experts/HalfCheetah-v5.onnx HalfCheetah-v5 \
+		--episodes 1 --horizon 300 --out runs/demo
+	$(BIN)/fdtasil distill experts/HalfCheetah-v5.onnx HalfCheetah-v5 --probes 0 \
+		--episodes 1 --horizon 300 --evaluation-episodes 0 --out runs/cloned
+	$(BIN)/fdtasil render HalfCheetah-v5 expert=experts/HalfCheetah-v5.onnx \
+		"plain cloning=runs/cloned/student.onnx" student=runs/demo/student.onnx \
+		--horizon 150 --every 2 --height 240 --out benchmarks/figures/film.webp
 
 test: .venv/ready
 	$(BIN)/python -m pytest -q -n 2 -m "not slow"

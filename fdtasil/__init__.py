@@ -41,6 +41,7 @@ if TYPE_CHECKING:
     from fdtasil.results.evaluation import Evaluation
     from fdtasil.rollouts.wanted import Environment
     from fdtasil.run.events import Event, Log
+    from fdtasil.run.film import render
     from fdtasil.run.pipeline import distill, evaluate
     from fdtasil.student.architectures import Mlp
     from fdtasil.student.fit import Fit
@@ -72,6 +73,7 @@ __all__ = [
     "from_minari",
     "gains",
     "load_expert",
+    "render",
     "to_minari",
 ]
 
@@ -90,6 +92,7 @@ _ROOMS = {
     "results.evaluation": ("Evaluation",),
     "rollouts.wanted": ("Environment",),
     "run.events": ("Event", "Log"),
+    "run.film": ("render",),
     "run.pipeline": ("distill", "evaluate"),
     "student.architectures": ("Mlp",),
     "student.fit": ("Fit",),

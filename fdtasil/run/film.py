@@ -1,0 +1,293 @@
+"""Policies side by side in a moving picture, from one start."""
+
+import os
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import replace
+from io import BytesIO
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from PIL import Image, ImageDraw, ImageFont
+
+from fdtasil.checks import check_count, check_path
+from fdtasil.errors import EnvironmentFault, ExportError, SettingError, first_line
+from fdtasil.experts.carrying import carry
+from fdtasil.experts.expert import Expert, Hints
+from fdtasil.experts.load import ExpertLike, open_expert, sized
+from fdtasil.experts.structure import in_spaces
+from fdtasil.files.storage import write_bytes
+from fdtasil.progress import Progress
+from fdtasil.rollouts.environments import EnvironmentLike, EnvironmentPool, resolve_horizon
+from fdtasil.rollouts.wanted import Environment
+from fdtasil.student.view import View
+
+__all__ = ["choose_renderer", "render"]
+
+_BAR, _MARGIN = 40, 8  # pixels above a picture, and around its text
+_INK, _PAPER, _FADED = (20, 20, 20), (255, 255, 255), 0.45
+_FPS = 30  # where the environment does not say
+_LAST = 1.0  # seconds that the last picture stands
+
+
+def render(
+    policies: Mapping[str, ExpertLike],
+    env: EnvironmentLike,
+    out: str | Path,
+    *,
+    seed: int = 0,
+    horizon: int | None = None,
+    every: int = 1,
+    height: int = 360,
+    progress: bool = True,
+) -> Path:
+    """Film policies side by side, from one start, with the return so far above each.
+
+    Args:
+        policies: By the name that stands above each: a student, an exported file, an expert.
+        env: A gymnasium id, an `Environment`, or a function that makes an environment with
+            `render_mode="rgb_array"`.
+        out: Ends with .mp4 (`pip install "fdtasil[video]"`), .webp or .gif.
+        seed: Of the start.
+        horizon: Steps after which the episode is cut; default: the environment's time limit.
+        every: Steps between two pictures; the film keeps the environment's pace.
+        height: Of a picture, in pixels.
+        progress: Show progress bars, where there is a terminal.
+
+    Raises:
+        SettingError: If an argument can't be used.
+        EnvironmentFault: If the environment draws no pictures.
+        ExportError: If the film can't be written.
+
+    Example::
+
+        fdtasil.render({"expert": "expert.onnx", "student": "student.onnx"}, "Ant-v5", "film.mp4")
+    """
+    path = check_path("out", out).absolute()
+    if path.suffix not in _WRITERS:
+        raise SettingError(
+            f"out={str(out)!r}", f"a name that ends with {' or '.join(_WRITERS)}", "write film.mp4"
+        )
+    if not isinstance(policies, Mapping) or not policies:
+        found = f"policies is a {type(policies).__name__}"
+        raise SettingError(found, "names with policies", 'write {"student": student}')
+    check_count("seed", seed, 0, 2**32 - 1)
+    every, height = check_count("every", every), check_count("height", height, 32)
+    bars = Progress(progress)
+    with ExitStack() as open_, bars.bar("film", "picture", 1) as bar:
+        players = [open_.enter_context(_Player(*pair, env, seed)) for pair in policies.items()]
+        steps = resolve_horizon(horizon, players[0].pool)
+        bar.lengthen(len(range(0, steps, every)))
+        pictures = _pictures(players, steps, every, height, bar.move)
+        fps = players[0].fps / every
+        write_bytes(path, _WRITERS[path.suffix](pictures, fps))
+    return Path(out)
+
+
+def choose_renderer() -> None:
+    """Let MuJoCo draw without a display, where there is none and nobody has said how.
+
+    MuJoCo reads it when it is imported.
+    """
+    if sys.platform == "linux" and not os.environ.get("DISPLAY"):
+        os.environ.setdefault("MUJOCO_GL", "egl")
+
+
+class _Player:
+    """A policy in an environment of its own."""
+
+    def __init__(self, name: str, policy: ExpertLike, env: EnvironmentLike, seed: int) -> None:
+        self.name, self.seed, self.total, self.step, self.over = str(name), seed, 0.0, 0, False
+        self.pool = EnvironmentPool(_drawing(env))
+        try:
+            self._act = _acting(policy, self.pool)
+            (self._env,) = self.pool.take(1)
+            _follow(self._env)
+            self._seen = np.asarray(
+                self._env.reset(seed=seed, options=_copied(self.pool.options))[0]
+            )
+            self.picture = self._drawn()
+        except BaseException:
+            self.pool.close()
+            raise
+        self.fps = float(self._env.metadata.get("render_fps") or _FPS)
+
+    def __enter__(self) -> "_Player":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.pool.close()
+
+    def move(self) -> None:
+        """Take a step; an episode that is over stands still."""
+        if self.over:
+            return
+        rows = self._seen[None].astype(np.float32)
+        action = self.pool.bounds.put_inside(self._act(rows))[0][0]
+        self._seen, reward, terminated, truncated, _ = self._env.step(action)
+        self.total, self.step = self.total + float(reward), self.step + 1
+        self.over = bool(terminated or truncated)
+
+    def draw(self) -> np.ndarray:
+        """Return the picture of now."""
+        if not self.over:
+            self.picture = self._drawn()
+        return self.picture
+
+    def _drawn(self) -> np.ndarray:
+        try:
+            found: Any = self._env.render()
+        except Exception as error:  # each library of graphics has its own
+            raise EnvironmentFault(
+                f"{self.pool.name} can't be drawn: {first_line(error)}",
+                "pictures without a display",
+                "set MUJOCO_GL=egl (or osmesa, after apt-get install libosmesa6) before Python "
+                "starts",
+            ) from error
+        if isinstance(found, np.ndarray) and found.ndim == 3 and found.shape[2] == 3:
+            return found.astype(np.uint8, copy=False)
+        raise EnvironmentFault(
+            f"render() of {self.pool.name} returned a {type(found).__name__}",
+            "a picture (height, width, 3)",
+            'make it with render_mode="rgb_array"',
+        )
+
+
+def _follow(env: gymnasium.Env) -> None:
+    """Use a MuJoCo model's own camera that follows, where nothing else does.
+
+    Without one a robot walks out of the picture: gymnasium's free camera stands still, unless its
+    settings name a body to track.
+    """
+    drawer: Any = getattr(env.unwrapped, "mujoco_renderer", None)
+    if drawer is None or "trackbodyid" in (drawer.default_cam_config or {}):
+        return
+    if getattr(drawer, "camera_id", None) == -1:
+        import mujoco
+
+        known: Any = mujoco  # the type stubs do not know all of it
+        kind = known.mjtObj.mjOBJ_CAMERA
+        drawer.camera_id = known.mj_name2id(drawer.model, kind, "track")  # -1 if there is none
+
+
+def _copied(options: Mapping[str, Any] | None) -> dict[str, Any] | None:
+    return None if options is None else dict(options)
+
+
+def _drawing(env: EnvironmentLike) -> EnvironmentLike:
+    """Return an environment that draws."""
+    wanted = env if isinstance(env, Environment) else Environment(env)
+    if isinstance(wanted.environment, str):
+        mode = {"render_mode": "rgb_array"}
+        return replace(wanted, kwargs={**(wanted.kwargs or {}), **mode}, num_envs=0)
+    if isinstance(wanted.environment, gymnasium.Env):
+        raise SettingError(
+            "an environment, for several policies to be filmed in",
+            "a gymnasium id, or a function that makes an environment",
+            "write lambda: gymnasium.make(..., render_mode='rgb_array')",
+        )
+    return wanted
+
+
+def _acting(policy: ExpertLike, pool: EnvironmentPool) -> Callable[[np.ndarray], np.ndarray]:
+    """Return what answers the environment's flat observations."""
+    n, m = pool.boxes.observation_size, pool.boxes.action_size
+    spaces = None if pool.spaces.plain else pool.spaces
+    opened: Expert = open_expert(policy, Hints(n, m, spaces=spaces))
+    if opened.columns is not None:
+        view = View.of(opened.columns, np.zeros((1, n), np.float32))
+        return view.policy(sized(opened, view.size, m).policy("evaluate"))
+    opened, _, _ = carry(sized(in_spaces(opened, spaces), n, m), pool)
+    return opened.policy("evaluate")
+
+
+def _pictures(
+    players: Sequence[_Player],
+    steps: int,
+    every: int,
+    height: int,
+    told: Callable[[int], None],
+) -> Iterator[np.ndarray]:
+    """Yield the pictures of a film, all of one size."""
+    for step in range(steps):
+        if step % every == 0:
+            yield np.concatenate([_panel(player, height) for player in players], axis=1)
+            told(1)
+        for player in players:
+            player.move()
+        if all(player.over for player in players):
+            break
+    yield np.concatenate([_panel(player, height) for player in players], axis=1)
+
+
+def _panel(player: _Player, height: int) -> np.ndarray:
+    """Return a picture with a name and a return above it; both sides even, as codecs want it."""
+    picture = player.draw()
+    height -= height % 2
+    width = 2 * round(height * picture.shape[1] / picture.shape[0] / 2)
+    shown = Image.fromarray(picture).resize((width, height), Image.Resampling.LANCZOS)
+    if player.over:
+        shown = Image.blend(shown, Image.new("RGB", shown.size, _PAPER), _FADED)
+    panel = Image.new("RGB", (width, height + _BAR), _PAPER)
+    panel.paste(shown, (0, _BAR))
+    pen, font = ImageDraw.Draw(panel), ImageFont.load_default(15)
+    pen.text((_MARGIN, _MARGIN), player.name, _INK, font)
+    told = f"{player.total:,.0f}" + f", ended at step {player.step}" * player.over
+    pen.text((width - _MARGIN, _MARGIN), told, _INK, font, anchor="ra")
+    return np.asarray(panel)
+
+
+def _mp4(pictures: Iterator[np.ndarray], fps: float) -> bytes:
+    try:
+        import imageio_ffmpeg
+    except ImportError as error:
+        raise ExportError(
+            "an .mp4 without the package imageio-ffmpeg", "it", 'pip install "fdtasil[video]"'
+        ) from error
+    from tempfile import TemporaryDirectory
+
+    first = next(pictures)
+    with TemporaryDirectory() as folder:
+        file = Path(folder, "film.mp4")
+        writer = imageio_ffmpeg.write_frames(
+            str(file),
+            (first.shape[1], first.shape[0]),
+            fps=fps,  # pyright: ignore[reportArgumentType]
+            macro_block_size=2,
+            quality=7,
+        )
+        writer.send(None)
+        last = first
+        writer.send(np.ascontiguousarray(first))
+        for last in pictures:
+            writer.send(np.ascontiguousarray(last))
+        for _ in range(round(_LAST * fps)):
+            writer.send(np.ascontiguousarray(last))
+        writer.close()
+        return file.read_bytes()
+
+
+def _still(kind: str, **options: Any) -> Callable[[Iterator[np.ndarray], float], bytes]:
+    """Return what writes a format of pictures that move."""
+
+    def write(pictures: Iterator[np.ndarray], fps: float) -> bytes:
+        first, *rest = (Image.fromarray(picture) for picture in pictures)
+        step = round(1000 / fps)
+        durations = [step] * len(rest) + [round(1000 * _LAST)]
+        target = BytesIO()
+        about = {"save_all": True, "append_images": rest, "duration": durations, "loop": 0}
+        first.save(target, kind, **about, **options)
+        return target.getvalue()
+
+    return write
+
+
+_WRITERS: dict[str, Callable[[Iterator[np.ndarray], float], bytes]] = {
+    ".mp4": _mp4,
+    ".webp": _still("WEBP", quality=60, method=4),
+    ".gif": _still("GIF", optimize=True),
+}
+"""Every format by the suffix of its file."""

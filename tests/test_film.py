@@ -1,0 +1,112 @@
+"""Films: one picture a step, a name and a return above each policy."""
+
+import gymnasium
+import numpy as np
+import pytest
+from conftest import QUICK, TOY, mlp_onnx
+from PIL import Image
+from toy_forms import InForm, in_form
+
+import fdtasil
+from fdtasil.errors import EnvironmentFault, SettingError
+
+pytestmark = pytest.mark.usefixtures("no_pictures")
+
+
+class Drawn(InForm):
+    """Paints the first position as a grey."""
+
+    metadata = {"render_modes": ["rgb_array"], "render_fps": 20}  # noqa: RUF012
+    render_mode = "rgb_array"
+
+    def render(self):
+        grey = int(np.clip(128 + 100 * self.position[0], 0, 255))
+        return np.full((40, 60, 3), grey, np.uint8)
+
+
+def push(rows):
+    return np.ones((len(rows), 2), np.float32)
+
+
+def rest(rows):
+    return np.zeros((len(rows), 2), np.float32)
+
+
+@pytest.mark.parametrize("suffix", [".gif", ".webp"])
+def test_one_picture_a_step_side_by_side(suffix, tmp_path):
+    file = fdtasil.render(
+        {"pushed": push, "at rest": rest}, Drawn, tmp_path / f"f{suffix}", horizon=12, height=80
+    )
+    film = Image.open(file)
+    assert 10 <= film.n_frames <= 13  # equal ones may be one, and the last state is shown
+    assert film.size == (2 * 120, 80 + 40)
+    frames = []
+    for number in range(film.n_frames):
+        film.seek(number)
+        frames.append(np.asarray(film.convert("L"), np.float64)[60:110])
+    left, right = (
+        [frame[:, part].mean() for frame in frames] for part in (np.s_[:110], np.s_[130:])
+    )
+    assert left[-1] > left[0] + 20  # it moves, from the same start
+    assert abs(left[0] - right[0]) < 3
+    assert np.ptp(right) < np.ptp(left)
+
+
+def test_every_other_step_and_an_early_end(tmp_path):
+    walled = lambda: Drawn(wall=0.9)  # noqa: E731
+    file = fdtasil.render({"pushed": push}, walled, tmp_path / "f.gif", horizon=60, every=2)
+    assert Image.open(file).n_frames < 20
+
+
+def test_an_mp4(tmp_path):
+    imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    file = fdtasil.render({"a": rest, "b": push}, Drawn, tmp_path / "f.mp4", horizon=10)
+    about = next(imageio_ffmpeg.read_frames(str(file)))
+    assert about["fps"] == 20
+    assert about["size"][0] == 2 * about["source_size"][0] // 2
+
+
+def test_students_of_every_form(tmp_path):
+    law = lambda x: np.clip(-x[:, :2], -1, 1)  # noqa: E731
+    expert = in_form(law, "nested", "choice")
+    made = lambda: Drawn("nested", "choice")  # noqa: E731
+    result = fdtasil.distill(expert, made, 0, **QUICK)
+    seen = fdtasil.distill(law, Drawn, 0, student_obs=[0, 1], **QUICK)
+    for name, student in (("a", result), ("b", seen)):
+        student.export(tmp_path / f"{name}.onnx")
+    policies = {"expert": expert, "student": result.student, "file": str(tmp_path / "a.onnx")}
+    assert fdtasil.render(policies, made, tmp_path / "f.gif", horizon=5).exists()
+    assert fdtasil.render(
+        {"some": str(tmp_path / "b.onnx")}, Drawn, tmp_path / "g.gif", horizon=5
+    ).exists()
+
+
+@pytest.mark.parametrize(
+    ("policies", "env", "out", "kind"),
+    [
+        ({"a": rest}, Drawn, "f.avi", SettingError),
+        ({}, Drawn, "f.gif", SettingError),
+        (rest, Drawn, "f.gif", SettingError),
+        ({"a": rest}, gymnasium.make("Pendulum-v1"), "f.gif", SettingError),
+        ({"a": rest}, InForm, "f.gif", EnvironmentFault),
+    ],
+)
+def test_what_can_not_be_filmed(policies, env, out, kind, tmp_path):
+    with pytest.raises(kind):
+        fdtasil.render(policies, env, tmp_path / out, horizon=3)
+    assert not list(tmp_path.iterdir())
+
+
+def test_the_command(tmp_path, inside, monkeypatch):
+    monkeypatch.setenv("MUJOCO_GL", "egl")
+    expert = mlp_onnx(tmp_path / "e.onnx")
+    gymnasium.register(
+        "toy/Drawn-v0", entry_point=lambda render_mode: Drawn(), max_episode_steps=9
+    )
+    done = inside("render", "toy/Drawn-v0", f"one={expert}", f"two={expert}", cwd=tmp_path)
+    assert done.returncode in (0, 1), done.stderr  # 1 without imageio-ffmpeg
+    done = inside("render", "toy/Drawn-v0", f"one={expert}", "--out", "f.webp", cwd=tmp_path)
+    assert "written: f.webp" in done.stdout, done.stderr
+    wrong = inside("render", TOY, str(expert), cwd=tmp_path)
+    assert wrong.returncode == 2
+    assert "NAME=FILE" in wrong.stderr
