@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from fdtasil.run.events import Event, Log
     from fdtasil.run.film import render
     from fdtasil.run.pipeline import distill, evaluate
+    from fdtasil.run.shrinking import shrink
     from fdtasil.student.architectures import Mlp
     from fdtasil.student.fit import Fit
     from fdtasil.student.history import History
@@ -74,6 +75,7 @@ __all__ = [
     "gains",
     "load_expert",
     "render",
+    "shrink",
     "to_minari",
 ]
 
@@ -94,6 +96,7 @@ _ROOMS = {
     "run.events": ("Event", "Log"),
     "run.film": ("render",),
     "run.pipeline": ("distill", "evaluate"),
+    "run.shrinking": ("shrink",),
     "student.architectures": ("Mlp",),
     "student.fit": ("Fit",),
     "student.history": ("History",),

@@ -10,7 +10,14 @@ from fdtasil.results.evaluation import Evaluation, interval_text, score_text
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["FIGURES", "draw_calibration", "draw_returns", "draw_training", "png_of"]
+__all__ = [
+    "FIGURES",
+    "draw_calibration",
+    "draw_returns",
+    "draw_sizes",
+    "draw_training",
+    "png_of",
+]
 
 _STUDENT, _EXPERT = "#1f77b4", "#444444"
 
@@ -40,6 +47,37 @@ def draw_training(history: Sequence[dict[str, float]]) -> bytes:
         panel.set_xlabel("training step")
         panel.grid(alpha=0.3, which="both", linewidth=0.5)
     panels[0].set_ylabel("mean norm")
+    return png_of(figure)
+
+
+def draw_sizes(candidates: Sequence[Any], keep: float) -> bytes:
+    """Draw return against bytes of students of several sizes, as a PNG.
+
+    Args:
+        candidates: As `fdtasil.run.shrinking.Candidate`.
+        keep: Share of the expert's return that is to be kept.
+    """
+    figure = _figure(6.0, 3.4)
+    panel = figure.subplots()
+    for cloned, name, colour, marker in (
+        (True, "plain cloning", _EXPERT, "s"),
+        (False, "with probes", _STUDENT, "o"),
+    ):
+        mine = [one for one in candidates if one.cloned == cloned and one.ci95 is not None]
+        if mine:
+            middle = [one.normalized_return for one in mine]
+            ends = [(one.normalized_return, *one.ci95) for one in mine]
+            bars = [[max(m - low, 0) for m, low, _ in ends], [max(h - m, 0) for m, _, h in ends]]
+            places = [one.bytes for one in mine]
+            about = {"color": colour, "marker": marker, "label": name, "capsize": 3}
+            panel.errorbar(places, middle, bars, linewidth=1.2, markersize=5, **about)
+    panel.axhline(1, color=_EXPERT, linewidth=0.8)
+    panel.axhline(keep, color=_EXPERT, linewidth=0.8, linestyle=":")
+    panel.set(xscale="log", xlabel="bytes of weights (float32)", ylabel="normalised return")
+    low = min((one.ci95[0] for one in candidates if one.ci95 is not None), default=0.0)
+    panel.set_ylim(max(low, -0.2) - 0.05, None)
+    panel.grid(alpha=0.3, which="both", linewidth=0.5)
+    panel.legend(frameon=False, fontsize=8)
     return png_of(figure)
 
 

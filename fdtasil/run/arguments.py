@@ -158,7 +158,7 @@ def read_arguments(
     episodes: int | None,
     horizon: int | None,
     seed: int,
-    student: Architecture | None,
+    student: Architecture | str | None,
     student_obs: StudentObservation | None,
     keep: str,
     spread: SpreadLike | None,

@@ -61,7 +61,7 @@ def distill(
     episodes: int | None = None,
     horizon: int | None = None,
     seed: int = 0,
-    student: Architecture | None = None,
+    student: Architecture | str | None = None,
     student_obs: StudentObservation | None = None,
     history: int = 1,
     keep: str = "all",
@@ -111,8 +111,9 @@ def distill(
         episodes: Number of demonstrations. Left out, 20, or those of `dataset`.
         horizon: Steps after which an episode is cut; default: the environment's time limit.
         seed: Equal seeds give equal bytes, on one machine with the same versions.
-        student: The architecture of its network, `fdtasil.Mlp(hidden, activation)`. Left out, two
-            hidden layers of 512, or of 256 where the expert is asked anew.
+        student: The architecture of its network, `fdtasil.Mlp(hidden, activation)`, or "micro",
+            64 x 64 with ReLU, for boards. Left out, two hidden layers of 512, or of 256 where the
+            expert is asked anew.
         student_obs: Indices of the coordinates that the student sees, names of parts of a
             dictionary, or a function (B, n) -> (B, k); the expert sees all. Probes move only what
             the student sees.

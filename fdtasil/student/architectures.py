@@ -100,12 +100,18 @@ def usual_architecture(*, anew: bool) -> Architecture:
     return Mlp((256, 256)) if anew else Mlp()
 
 
+PRESETS: dict[str, Architecture] = {"micro": Mlp((64, 64), "relu")}
+"""Architectures by a name: for boards, whose runtimes have ReLU and 26 kB to spare."""
+
+
 def check_architecture(student: object) -> Architecture:
     """Return the architecture that a caller means; a class of one is called.
 
     Raises:
         SettingError: If it is none that files can name.
     """
+    if isinstance(student, str):
+        return PRESETS[check_choice("student", student, PRESETS)]
     made = student() if isinstance(student, type) and _is_known(student) else student
     if _is_known(type(made)):
         return made  # pyright: ignore[reportReturnType]

@@ -1,0 +1,307 @@
+"""The smallest student that keeps the expert's level, from the answers that are there."""
+
+import json
+from collections.abc import Callable, Sequence
+from concurrent.futures import ProcessPoolExecutor, as_completed
+from dataclasses import dataclass, replace
+from functools import partial
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from fdtasil.checks import check_count, check_flag, check_path, check_share
+from fdtasil.errors import SettingError, warn
+from fdtasil.experts.load import ExpertLike
+from fdtasil.files.lock import locked
+from fdtasil.files.storage import write_bytes
+from fdtasil.progress import Progress
+from fdtasil.results.distilled import Distilled
+from fdtasil.results.evaluation import interval_text, score_text
+from fdtasil.results.figures import draw_sizes
+from fdtasil.rollouts.environments import EnvironmentLike
+from fdtasil.run.pipeline import distill
+from fdtasil.student.architectures import Mlp
+from fdtasil.student.fit import Fit
+
+__all__ = ["LADDER", "Candidate", "Shrunk", "shrink"]
+
+LADDER: tuple[tuple[int, ...], ...] = (
+    (8, 8),
+    (16, 16),
+    (32, 32),
+    (64, 64),
+    (128, 128),
+    (256, 256),
+)
+"""Hidden layers of the students that are tried, the smallest first."""
+
+
+@dataclass(frozen=True)
+class Candidate:
+    """A student of one size, as it was judged.
+
+    Attributes:
+        hidden: Widths of its hidden layers.
+        activation: Between them.
+        cloned: Whether it was cloned plainly, without probes.
+        bytes: Of its float32 weights.
+        multiply_adds: For one observation.
+        microseconds: Of `predict`, for one observation.
+        normalized_return: The expert's is 1; None where the expert's means nothing.
+        ci95: 95 % interval of it, over paired episodes.
+        survival: Share of its episodes that the environment did not end.
+    """
+
+    hidden: tuple[int, ...]
+    activation: str
+    cloned: bool
+    bytes: int
+    multiply_adds: int
+    microseconds: float
+    normalized_return: float | None
+    ci95: tuple[float, float] | None
+    survival: float
+
+    @property
+    def name(self) -> str:
+        """Its widths and activation as a text."""
+        return f"{'x'.join(map(str, self.hidden)) or 'linear'} {self.activation}"
+
+    def keeps(self, share: float) -> bool:
+        """Whether the lower end of its interval is at least a share of the expert's return."""
+        return self.ci95 is not None and self.ci95[0] >= share
+
+
+@dataclass(frozen=True, repr=False)
+class Shrunk:
+    """Students of several sizes.
+
+    Attributes:
+        keep: Share of the expert's return that was to be kept.
+        candidates: All that were tried, with probes and cloned, the smallest first.
+        result: The smallest with probes that keeps the share; None where none does.
+    """
+
+    keep: float
+    candidates: tuple[Candidate, ...]
+    result: Distilled | None
+
+    @property
+    def smallest(self) -> Candidate | None:
+        """The smallest student with probes that keeps the share."""
+        return self._smallest(cloned=False)
+
+    @property
+    def smallest_cloned(self) -> Candidate | None:
+        """The smallest that keeps it without probes."""
+        return self._smallest(cloned=True)
+
+    def _smallest(self, *, cloned: bool) -> Candidate | None:
+        kept = (one for one in self.candidates if one.cloned == cloned and one.keeps(self.keep))
+        return next(kept, None)
+
+    def draw(self) -> bytes:
+        """Return a picture: return against bytes, with and without probes, as a PNG."""
+        return draw_sizes(self.candidates, self.keep)
+
+    def __repr__(self) -> str:
+        head = (
+            f"{'student':18}{'bytes':>10}{'us':>7}{'return':>9}  {'95 % interval':18}{'cloned':>8}"
+        )
+        lines = [head]
+        cloned = {one.name: one for one in self.candidates if one.cloned}
+        for one in self.candidates:
+            if not one.cloned:
+                beside = cloned.get(one.name)
+                plain = "" if beside is None else score_text(beside.normalized_return)
+                mark = " <" if one == self.smallest else ""
+                lines.append(
+                    f"{one.name:18}{one.bytes:10,}{one.microseconds:7.0f}"
+                    f"{score_text(one.normalized_return):>9}  {interval_text(one.ci95):18}"
+                    f"{plain:>8}{mark}"
+                )
+        found = self.smallest
+        lines.append(
+            f"no student of these keeps {self.keep:.0%} of the expert's return"
+            if found is None
+            else f"the smallest that keeps {self.keep:.0%}: {found.name}, {found.bytes:,} bytes"
+        )
+        return "\n".join(lines)
+
+
+def shrink(
+    run: Distilled | str | Path,
+    expert: ExpertLike,
+    env: EnvironmentLike,
+    *,
+    keep: float = 0.95,
+    sizes: Sequence[tuple[int, ...]] = LADDER,
+    activations: Sequence[str] = ("relu",),
+    cloned: bool = True,
+    evaluation_episodes: int = 20,
+    horizon: int | None = None,
+    seed: int | None = None,
+    fit: Fit | None = None,
+    out: str | Path | None = None,
+    workers: int = 1,
+    progress: bool = True,
+) -> Shrunk:
+    """Find the smallest student that keeps a share of the expert's return.
+
+    Nothing is recorded again: each student learns from the demonstrations of a run, and from the
+    answers that are stored with them; where the run asked a cheap expert anew, so do these.
+
+    Args:
+        run: A result, or the folder of one.
+        expert: The expert of that run, as in `distill`.
+        env: Its environment.
+        keep: Share of the expert's paired return; the lower end of the interval must reach it.
+        sizes: Hidden layers of the students that are tried.
+        activations: Of each size. "relu" is what boards and verifiers have.
+        cloned: Also train each without probes, to show what these are worth.
+        evaluation_episodes: Paired episodes; the more, the narrower the interval.
+        horizon: As in `distill`; left out, the run's.
+        seed: Left out, the run's.
+        fit: As in `distill`.
+        out: Folder of the runs, one for each student; those that are finished are taken as they
+            are, so that it may be killed and begun again.
+        workers: Students that are trained side by side, in processes; the expert must be a path
+            or an address then, and the environment an id.
+        progress: Show a progress bar, where there is a terminal.
+
+    Raises:
+        SettingError: If an argument can't be used.
+
+    Example::
+
+        found = fdtasil.shrink("runs/cheetah", "HalfCheetah-v5.onnx", "HalfCheetah-v5")
+        print(found)
+        found.result.export("student.c")
+    """
+    share, workers = check_share("keep", keep), check_count("workers", workers)
+    result = run if isinstance(run, Distilled) else Distilled.load(check_path("run", run))
+    jobs = _jobs(sizes, activations, cloned=check_flag("cloned", cloned))
+    if workers > 1 and not (isinstance(expert, str | Path) and isinstance(env, str)):
+        raise SettingError(
+            f"workers={workers} with an expert or an environment of this process",
+            "a path or an address, and an id",
+            "leave workers= out",
+        )
+    folder = None if out is None else check_path("out", out).absolute()
+    settings: dict[str, Any] = {
+        "dataset": result.dataset,
+        "evaluation_episodes": check_count("evaluation_episodes", evaluation_episodes, 2),
+        "horizon": result.settings["horizon"] if horizon is None else horizon,
+        "seed": result.settings["seed"] if seed is None else seed,
+        "fit": fit,
+        "progress": False,
+    }
+    train = partial(_trained, expert, env, settings, folder)
+    found = dict[_Job, Distilled]()
+    with Progress(check_flag("progress", progress)).bar("students", "student", len(jobs)) as bar:
+        for job, student in _all(train, jobs, workers):
+            found[job] = student
+            bar.move(1)
+    shrunk = _judged(found, share)
+    if folder is not None:
+        _write(shrunk, folder)
+    if shrunk.result is None:
+        warn(f"no student of {len(jobs)} keeps {share:.0%} of the expert's return")
+    return shrunk
+
+
+@dataclass(frozen=True)
+class _Job:
+    hidden: tuple[int, ...]
+    activation: str
+    cloned: bool
+
+    @property
+    def folder(self) -> str:
+        widths = "x".join(map(str, self.hidden)) or "linear"
+        return f"{widths}-{self.activation}{'-cloned' * self.cloned}"
+
+
+def _jobs(
+    sizes: Sequence[tuple[int, ...]], activations: Sequence[str], *, cloned: bool
+) -> list[_Job]:
+    """Return what is to be trained; what can't be built is refused before anything is."""
+    jobs = []
+    for hidden in sizes:
+        for activation in activations:
+            widths = Mlp(hidden, activation).hidden
+            assert isinstance(widths, tuple)
+            jobs += [_Job(widths, activation, plain) for plain in ((False, True)[: 1 + cloned])]
+    if not jobs:
+        raise SettingError("no sizes", "one student at least", "leave sizes= out")
+    return jobs
+
+
+def _all(
+    train: Callable[[_Job], Distilled], jobs: Sequence[_Job], workers: int
+) -> "Sequence[tuple[_Job, Distilled]] | Any":
+    if workers == 1:
+        yield from ((job, train(job)) for job in jobs)
+        return
+    # Fresh processes: a copy of this one would have its threads' locks, and not its threads.
+    with ProcessPoolExecutor(workers, get_context("spawn"), torch.set_num_threads, (1,)) as pool:
+        started = {pool.submit(train, job): job for job in jobs}
+        for done in as_completed(started):
+            yield started[done], done.result()
+
+
+def _trained(
+    expert: ExpertLike,
+    env: EnvironmentLike,
+    settings: dict[str, Any],
+    folder: Path | None,
+    job: _Job,
+) -> Distilled:
+    place = None if folder is None else folder / job.folder
+    if place is not None and (place / "manifest.json").exists():
+        return Distilled.load(place)
+    given = dict(settings)
+    if job.cloned:
+        given["dataset"] = replace(settings["dataset"], probes=None, answers=None)
+    return distill(
+        expert,
+        env,
+        0 if job.cloned else None,
+        student=Mlp(job.hidden, job.activation),
+        out=place,
+        **given,
+    )
+
+
+def _judged(found: dict[_Job, Distilled], keep: float) -> Shrunk:
+    judged = [(_candidate(job, result), result) for job, result in found.items()]
+    judged.sort(key=lambda pair: (pair[0].bytes, pair[0].activation, pair[0].cloned))
+    kept = (result for one, result in judged if not one.cloned and one.keeps(keep))
+    return Shrunk(keep, tuple(one for one, _ in judged), next(kept, None))
+
+
+def _candidate(job: _Job, result: Distilled) -> Candidate:
+    size, evaluation = result.report["size"]["student"], result.evaluation
+    assert evaluation is not None, "there is an expert and an environment"
+    return Candidate(
+        job.hidden,
+        job.activation,
+        job.cloned,
+        size["bytes"],
+        size["multiply_adds"],
+        size["microseconds"],
+        evaluation.normalized_return,
+        evaluation.ci95,
+        evaluation.survival,
+    )
+
+
+def _write(shrunk: Shrunk, folder: Path) -> None:
+    """Write table and picture beside the runs."""
+    rows = [vars(one) | {"name": one.name} for one in shrunk.candidates]
+    table = {"keep": shrunk.keep, "candidates": rows}
+    with locked(folder):
+        write_bytes(folder / "sizes.json", (json.dumps(table, indent=1) + "\n").encode())
+        write_bytes(folder / "sizes.png", shrunk.draw())

@@ -1,0 +1,69 @@
+"""`fdtasil shrink`: students of several sizes from one run's answers."""
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from fdtasil.run.shrinking import shrink
+from fdtasil.shell.call import wanted
+from fdtasil.shell.command import EnvironmentId, ExpertPath, import_module_of
+
+__all__ = ["command"]
+
+RunFolder = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+
+
+def command(
+    run: RunFolder,
+    expert: ExpertPath,
+    env: EnvironmentId,
+    /,
+    *,
+    out: Path = Path("runs/shrunk"),
+    keep: float = 0.95,
+    widths: tuple[int, ...] = (8, 16, 32, 64, 128, 256),
+    layers: int = 2,
+    activations: tuple[str, ...] = ("relu",),
+    cloned: bool = True,
+    evaluation_episodes: int = 20,
+    workers: int = 1,
+    env_kwargs: str | None = None,
+    reset_options: str | None = None,
+) -> None:
+    """Find the smallest student that keeps the expert's level, without recording again.
+
+    Args:
+        run: Folder of a finished run.
+        expert: The expert of that run.
+        env: Its environment.
+        out: Folder of the runs, one for each student; what is finished in it is taken as it is.
+        keep: Share of the expert's return that the lower end of the interval must reach.
+        widths: Of the hidden layers, one student each.
+        layers: Hidden layers of each.
+        activations: Of each size.
+        cloned: Also train each without probes.
+        evaluation_episodes: Paired episodes.
+        workers: Students that are trained side by side.
+        env_kwargs: What the environment is made with, as JSON.
+        reset_options: What each reset is given as its options, as JSON.
+    """
+    folder = out.absolute()
+    import_module_of(env)
+    place = wanted(env, env_kwargs, reset_options)
+    assert place is not None
+    sizes = [(width,) * layers for width in widths]
+    found = shrink(
+        run,
+        expert,
+        place,
+        keep=keep,
+        sizes=sizes,
+        activations=activations,
+        cloned=cloned,
+        evaluation_episodes=evaluation_episodes,
+        out=folder,
+        workers=workers,
+    )
+    print(found)
+    print(f"saved in {out}: sizes.json, sizes.png, and a run for each student")
