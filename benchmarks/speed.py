@@ -63,7 +63,7 @@ def cells(quick: bool) -> list[Cell]:
         experts = experts[:1]
     found += [{"what": "asking", "expert": name} for name in experts]
     found += [{"what": "stepping", "expert": name} for name in experts]
-    return found + [{"what": "stepping together", "expert": experts[0], "count": TOGETHER}]
+    return [*found, {"what": "stepping together", "expert": experts[0], "count": TOGETHER}]
 
 
 def measure(cell: Cell, device: str) -> dict[str, Any]:

@@ -208,7 +208,8 @@ def shrink(
     if folder is not None:
         _write(shrunk, folder)
     if shrunk.result is None:
-        warn(f"no student of {len(jobs)} keeps {share:.0%} of the expert's return")
+        count = sum(not job.cloned for job in jobs)
+        warn(f"no student of {count} keeps {share:.0%} of the expert's return")
     return shrunk
 
 

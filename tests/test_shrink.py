@@ -1,0 +1,105 @@
+"""Students of several sizes from one run's answers: nothing recorded again, resumable, judged."""
+
+import json
+
+import numpy as np
+import pytest
+from conftest import GAIN, QUICK, TOY, mlp_onnx
+
+import fdtasil
+from fdtasil.errors import FdtasilWarning, SettingError
+
+pytestmark = pytest.mark.usefixtures("no_pictures")
+SIZES = [(2,), (16, 16)]
+FAST = {"sizes": SIZES, "evaluation_episodes": 4, "horizon": 30, "progress": False}
+
+
+def law(rows):
+    return np.clip(np.asarray(rows, np.float32) @ GAIN.T, -1, 1)
+
+
+@pytest.fixture(scope="module")
+def run():
+    return fdtasil.distill(
+        law, TOY, 5, **{**QUICK, "episodes": 3, "horizon": 30, "fit": fdtasil.Fit(steps=600)}
+    )
+
+
+def test_the_smallest_that_keeps_the_level(run, tmp_path):
+    asked = []
+
+    def counted(rows):
+        asked.append(len(rows))
+        return law(rows)
+
+    fit = fdtasil.Fit(steps=1500)
+    found = fdtasil.shrink(run, counted, TOY, keep=0.8, fit=fit, out=tmp_path / "s", **FAST)
+    names = [(one.name, one.cloned) for one in found.candidates]
+    assert names == [(n, c) for n in ("2 relu", "16x16 relu") for c in (False, True)]
+    assert found.smallest is not None
+    assert found.smallest.keeps(0.8)
+    assert found.result.evaluation.ci95 == found.smallest.ci95
+    assert found.result.report["size"]["student"]["bytes"] == found.smallest.bytes
+    # Answers are those of the run: only acting and the gate ask, and never a probe.
+    assert found.result.queries["probe"] == found.result.queries["act"] == 0
+    assert "<" in str(found)
+    table = json.loads((tmp_path / "s" / "sizes.json").read_text())
+    assert [one["bytes"] for one in table["candidates"]] == [o.bytes for o in found.candidates]
+    assert (tmp_path / "s" / "sizes.png").stat().st_size > 1000
+
+    # What is finished is taken as it is.
+    before = len(asked)
+    again = fdtasil.shrink(run, counted, TOY, keep=0.8, fit=fit, out=tmp_path / "s", **FAST)
+    assert len(asked) == before
+    assert again.candidates == found.candidates
+
+
+def test_none_that_keeps_it(run):
+    fit = fdtasil.Fit(steps=2)
+    with pytest.warns(FdtasilWarning, match="no student of 2 keeps 100%"):
+        found = fdtasil.shrink(
+            run, law, TOY, keep=1.0, fit=fit, cloned=False, **{**FAST, "sizes": [(2,), (3,)]}
+        )
+    assert found.result is None
+    assert found.smallest is None
+    assert "no student" in str(found)
+
+
+def test_side_by_side_they_are_the_same(tmp_path):
+    expert = str(mlp_onnx(tmp_path / "e.onnx"))
+    run = fdtasil.distill(expert, TOY, 3, **QUICK)
+    options = {**FAST, "fit": fdtasil.Fit(steps=20), "cloned": False, "keep": 0.0}
+    alone = fdtasil.shrink(run, expert, TOY, **options, out=tmp_path / "one")
+    pair = fdtasil.shrink(run, expert, TOY, **options, out=tmp_path / "two", workers=2)
+    for one, other in zip(alone.candidates, pair.candidates, strict=True):
+        assert one.ci95 == other.ci95
+    names = ("student.onnx", "student.safetensors")
+    for name in names:
+        parts = [(tmp_path / f / "2-relu" / name).read_bytes() for f in ("one", "two")]
+        assert parts[0] == parts[1]
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"keep": 2.0}, {"sizes": []}, {"activations": ["gellu"]}, {"workers": 2}, {"sizes": [(0,)]}],
+)
+def test_what_can_not_be_shrunk(run, wrong):
+    with pytest.raises(SettingError):
+        fdtasil.shrink(run, law, TOY, **{**FAST, **wrong})
+
+
+def test_the_command(tmp_path, inside):
+    expert = mlp_onnx(tmp_path / "e.onnx")
+    fdtasil.distill(str(expert), TOY, 2, **QUICK).save(tmp_path / "run")
+    line = ["shrink", tmp_path / "run", expert, TOY, "--widths", "4", "--keep", "0.0"]
+    done = inside(*line, "--evaluation-episodes", "2", "--no-cloned", cwd=tmp_path)
+    assert done.returncode == 0, done.stderr
+    assert "4x4 relu" in done.stdout
+    assert (tmp_path / "runs" / "shrunk" / "4x4-relu" / "student.onnx").exists()
+
+
+def test_micro():
+    result = fdtasil.distill(law, TOY, 2, **{**QUICK, "student": "micro"})
+    assert result.student.architecture == fdtasil.Mlp((64, 64), "relu")
+    with pytest.raises(SettingError, match="micro"):
+        fdtasil.distill(law, TOY, 2, **{**QUICK, "student": "macro"})
