@@ -4,7 +4,7 @@ BIN = .venv/bin
 # One thread per process: several at once on few cores are many times slower otherwise.
 export OMP_NUM_THREADS = 1
 
-.PHONY: demo film test torture lint types wheel check clean
+.PHONY: demo docs film test torture lint types wheel check clean
 
 demo: .venv/ready
 	$(BIN)/fdtasil distill experts/HalfCheetah-v5.onnx HalfCheetah-v5 \
@@ -43,7 +43,7 @@ wheel: .venv/ready
 	.wheel/bin/pip install --quiet --disable-pip-version-check -c constraints.txt dist/*.whl
 	cd .wheel && bin/python -P ../tests/wheel_run.py
 
-check: lint types wheel test
+check: lint types docs wheel test
 
 # torch goes first and pinned: left to itself pip would take a build with gigabytes of CUDA.
 .venv/ready: pyproject.toml constraints.txt
@@ -52,5 +52,9 @@ check: lint types wheel test
 	$(BIN)/pip install --quiet --disable-pip-version-check -c constraints.txt -e ".[dev]"
 	touch $@
 
+# The documentation as pages; a warning is an error.
+docs: .venv/ready
+	$(BIN)/sphinx-build -q -W --keep-going docs docs/_build
+
 clean:
-	rm -rf .venv .wheel build dist
+	rm -rf .venv docs/_build .wheel build dist
