@@ -1,15 +1,36 @@
 """The examples do what they say."""
 
+import runpy
 import sys
 from importlib import import_module
 from pathlib import Path
 
 import numpy as np
 import pytest
+from sb3_agents import seeded
 
 import fdtasil
+from fdtasil.student.schedule import Schedule
 
 EXAMPLES = Path(__file__).parent.parent / "examples"
+SCRIPTS = sorted(path.stem for path in EXAMPLES.glob("*.py") if path.stem[:11] != "constrained")
+
+
+@pytest.mark.usefixtures("no_pictures")
+@pytest.mark.filterwarnings("ignore::fdtasil.FdtasilWarning")
+@pytest.mark.parametrize("script", SCRIPTS)
+def test_every_script_runs(script, tmp_path, monkeypatch, capsys):
+    """As it is written, but for the length of the trainings."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(Schedule, "total_steps", lambda schedule, states: 30)
+    monkeypatch.setattr(sys, "argv", [f"{script}.py"])
+    with seeded():
+        source = (EXAMPLES / f"{script}.py").read_text().replace("5_000", "200")
+        (tmp_path / "examples").mkdir()
+        (tmp_path / "experts").symlink_to(EXAMPLES.parent / "experts")
+        (tmp_path / "examples" / f"{script}.py").write_text(source)
+        runpy.run_path(str(tmp_path / "examples" / f"{script}.py"), run_name="__main__")
+    assert capsys.readouterr().out.strip()
 
 
 @pytest.fixture
