@@ -23,8 +23,10 @@ from fdtasil.files.run_format import CONFIG, check_free, stamped, unstamped
 from fdtasil.files.storage import add_to_folder, to_json, verify, write_bytes, write_folder
 from fdtasil.probes.answers import Answers
 from fdtasil.probes.calibration import Calibration
+from fdtasil.results.card import card_of
 from fdtasil.results.evaluation import Evaluation
 from fdtasil.results.figures import FIGURES
+from fdtasil.results.page import result_html
 from fdtasil.student.exports import export
 from fdtasil.student.policy import Student
 from fdtasil.student.view import StudentObservation, Unseen, View
@@ -82,6 +84,9 @@ class Distilled:
         ]
         return "\n".join(lines)
 
+    def _repr_html_(self) -> str:
+        return result_html(self)
+
     @property
     def demonstrations(self) -> Demonstrations:
         """The labelled states."""
@@ -128,9 +133,10 @@ class Distilled:
     def save(self, folder: str | Path) -> Path:
         """Write the run folder.
 
-        Files: config.json, report.json, progress.csv, demonstrations.npz, student.safetensors,
-        student.onnx, the pictures of `FIGURES` that there is something to draw for, and last a
-        manifest. What can't be drawn or exported is left out with a warning.
+        Files: config.json, report.json, README.md (a model card), progress.csv,
+        demonstrations.npz, student.safetensors, student.onnx, the pictures of `FIGURES` that there
+        is something to draw for, and last a manifest. What can't be drawn or exported is left out
+        with a warning.
 
         Args:
             folder: One that is missing, empty, or a run's, which is replaced.
@@ -227,6 +233,7 @@ def write_run(result: Distilled, folder: Path) -> None:
         "demonstrations.npz": result.dataset.to_bytes(),
         "student.safetensors": result.export_bytes("student.safetensors"),
         **_attempted({"student.onnx": lambda: result.export_bytes("student.onnx")}, notes),
+        "README.md": card_of(result).encode(),
         "report.json": _with_notes(report, notes),
     }
     write_folder(folder, core)

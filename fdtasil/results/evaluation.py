@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from html import escape
 from typing import Any
 
 import numpy as np
@@ -25,6 +26,7 @@ __all__ = [
     "Evaluation",
     "check_constraints",
     "evaluate_pair",
+    "evaluation_rows",
     "interval_text",
     "score_text",
 ]
@@ -105,6 +107,13 @@ class Evaluation:
         """Read what `to_json` returned."""
         return from_plain(cls, fields)
 
+    def _repr_html_(self) -> str:
+        lines = "".join(
+            f"<tr><td>{escape(name)}</td><td>{escape(text)}</td></tr>"
+            for name, text in evaluation_rows(self)
+        )
+        return f"<table>{lines}</table>"
+
     def __str__(self) -> str:
         expert = f"{self.expert_return:10.1f}   survival {self.expert_survival:.2f}"
         student = f"{self.student_return:10.1f}   survival {self.survival:.2f}"
@@ -130,6 +139,28 @@ class Evaluation:
             return ""
         told = f"{self.roughness:10.3f}   expert {self.expert_roughness:.3f}, change in a step"
         return f"\n  roughness         {told}"
+
+
+def evaluation_rows(found: Evaluation) -> list[tuple[str, str]]:
+    """Return an evaluation as names and texts."""
+    rows = [
+        (
+            "normalised return",
+            f"{score_text(found.normalized_return)} {interval_text(found.ci95)}",
+        ),
+        ("return", f"{found.student_return:,.1f}, the expert's {found.expert_return:,.1f}"),
+        ("survival", f"{found.survival:.2f}, the expert's {found.expert_survival:.2f}"),
+        ("episodes", f"{found.episodes} from equal starts, of {found.horizon} steps"),
+        ("action error", f"{found.action_error:.3g} on the student's own states"),
+    ]
+    if found.agreement is not None:
+        rows.append(("agreement", f"{found.agreement:.3f} of its choices"))
+    if found.roughness is not None and found.expert_roughness is not None:
+        told = f"{found.roughness:.3g}, the expert's {found.expert_roughness:.3g}"
+        rows.append(("change of an action in a step", told))
+    for name, theirs, ours in found.violations:
+        rows.append((f"{name} violated", f"{ours:.2%} of the steps, the expert {theirs:.2%}"))
+    return rows
 
 
 def evaluate_pair(

@@ -19,6 +19,7 @@ COMMANDS = {
     "evaluate": "a policy beside an expert, from the same starts",
     "gains": "the Jacobian of an expert that does not give it, with its error",
     "shrink": "the smallest student that keeps the expert's level",
+    "report": "everything that a run knows, on one page",
     "render": "a film of policies side by side",
     "export": "the student of a run as ONNX, C or numpy",
     "export-sb3": "an agent of stable-baselines3 as one ONNX file",

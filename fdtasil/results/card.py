@@ -1,0 +1,62 @@
+"""A run's model card: what it is, how good, of whom, and what it is not for."""
+
+from typing import Any
+
+from fdtasil.results.evaluation import evaluation_rows
+from fdtasil.results.summary import call_of, run_rows
+
+__all__ = ["card_of"]
+
+_HEAD = """---
+library_name: fdtasil
+tags:
+- imitation-learning
+- policy-distillation
+- reinforcement-learning
+---
+"""
+
+
+def card_of(result: Any) -> str:
+    """Return a model card in Markdown, in the form of the Hugging Face hub.
+
+    Args:
+        result: A `Distilled`.
+    """
+    report, evaluation = result.report, result.evaluation
+    judged = "It was not compared with its expert."
+    if evaluation is not None:
+        judged = _table(evaluation_rows(evaluation))
+    warnings = [f"- {_cell(text)}" for text in report["warnings"]] or ["- no warnings"]
+    return "\n".join(
+        [
+            _HEAD,
+            f"# A student for {_cell(report['env'])}\n",
+            "A small policy that was distilled from an expert by "
+            "[fdtasil](https://arxiv.org/abs/2205.14812): it matches the expert's actions at the "
+            "states of demonstrations, and around them.\n",
+            "## How good\n",
+            f"{judged}\n",
+            "## How it came to be\n",
+            _table(run_rows(report)) + "\n",
+            "## Limits\n",
+            "It was judged in this environment, from its own starts. Elsewhere nobody has looked.",
+            "\n".join(warnings) + "\n",
+            "## Files\n",
+            "`student.onnx` (input `obs`, normaliser and bounds inside), `student.safetensors`, "
+            "`demonstrations.npz`, `report.json`, `config.json`, `figures/`.\n",
+            "## Again\n",
+            f"```python\n{call_of(result.settings)}```\n",
+        ]
+    )
+
+
+def _table(rows: list[tuple[str, str]]) -> str:
+    lines = [f"| {_cell(name)} | {_cell(text)} |" for name, text in rows]
+    return "\n".join(["| | |", "|---|---|", *lines])
+
+
+def _cell(text: str) -> str:
+    """Return a text that can't leave its cell, or be a link."""
+    plain = "".join(c if c.isprintable() else " " for c in text)
+    return plain.replace("|", "\\|").replace("[", "\\[").replace("<", "&lt;")

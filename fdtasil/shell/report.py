@@ -1,0 +1,26 @@
+"""`fdtasil report`: a run on one page."""
+
+from pathlib import Path
+from typing import Annotated
+
+import tyro
+
+from fdtasil.files.storage import write_bytes
+from fdtasil.results.distilled import Distilled
+from fdtasil.results.page import page_of
+
+__all__ = ["command"]
+
+RunFolder = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
+
+
+def command(run: RunFolder, /, *, out: Path | None = None) -> None:
+    """Write everything that a run knows as one page of HTML, which needs no network.
+
+    Args:
+        run: Folder of a finished run.
+        out: Where; left out, RUN.html beside the folder.
+    """
+    file = run.absolute().with_suffix(".html") if out is None else out.absolute()
+    write_bytes(file, page_of(Distilled.load(run)).encode())
+    print(f"written: {file.name if out is None else out}")

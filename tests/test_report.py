@@ -1,0 +1,81 @@
+"""A run on one page, as a model card, and in a notebook: nothing of it can become code."""
+
+import pickle
+import re
+from html.parser import HTMLParser
+
+import pytest
+from conftest import QUICK, TOY
+
+import fdtasil
+from fdtasil.results.card import card_of
+from fdtasil.results.page import page_of
+
+pytestmark = pytest.mark.usefixtures("no_pictures")
+
+
+class Tags(HTMLParser):
+    def __init__(self, text):
+        super().__init__()
+        self.found, self.links = [], []
+        self.feed(text)
+
+    def handle_starttag(self, tag, attributes):
+        self.found.append(tag)
+        self.links += [value for name, value in attributes if name in ("src", "href")]
+
+
+@pytest.fixture
+def spoilt(quick):
+    """A run whose texts come from somebody who means harm."""
+    bad = "<script>alert(1)</script>|[x](http://evil)\n# head"
+    report = {**quick.report, "env": bad, "warnings": [bad]}
+    report["expert"] = {**report["expert"], "path": bad}
+    return fdtasil.Distilled(**{**vars(quick), "report": report})
+
+
+def test_the_page_has_everything_and_asks_nobody(quick):
+    text = page_of(quick)
+    tags = Tags(text)
+    assert "script" not in tags.found
+    assert all(link.startswith("data:image/png") for link in tags.links)
+    for told in (quick.report["env"], "normalised return", "queries", "fdtasil.distill("):
+        assert told in text
+
+
+def test_texts_of_a_file_stay_texts(spoilt):
+    assert "script" not in Tags(page_of(spoilt)).found
+    assert "script" not in Tags(spoilt._repr_html_()).found
+    card = card_of(spoilt)
+    assert "<script" not in card
+    assert "\n# head" not in card
+    assert not re.search(r"(?<!\\)\[x\]\(http", card)
+
+
+def test_the_command_and_the_card_of_a_folder(quick_folder, inside, tmp_path):
+    done = inside("report", quick_folder, "--out", tmp_path / "r.html")
+    assert done.returncode == 0, done.stderr
+    assert (tmp_path / "r.html").read_text().startswith("<!doctype html>")
+    card = (quick_folder / "README.md").read_text()
+    assert card.startswith("---\nlibrary_name: fdtasil")
+    assert "## How good" in card
+
+
+def test_the_call_of_the_card_repeats_the_run(tmp_path, linear):
+    """With an expert of its own: a function has no path."""
+    result = fdtasil.distill(linear, TOY, 3, **QUICK)
+    block = re.search(r"```python\n(.*?)```", card_of(result), re.S)[1]
+    code = block.replace(repr(result.settings["expert"]), "expert").replace(
+        repr(result.settings["env"]), "env"
+    )
+    session = {"expert": linear, "env": TOY}
+    exec(code, session)
+    assert session["result"].student.to_bytes() == result.student.to_bytes()
+
+
+def test_notebooks_and_pickles(quick):
+    assert "<table>" in quick._repr_html_()
+    assert "<table>" in quick.evaluation._repr_html_()
+    again = pickle.loads(pickle.dumps(quick))
+    assert again.student.to_bytes() == quick.student.to_bytes()
+    assert again.evaluation == quick.evaluation
