@@ -198,3 +198,26 @@ def test_weights_that_are_none(tmp_path):
         (tmp_path / "s.safetensors").write_bytes(data)
         with pytest.raises(ValueError, match="not the weights"):
             PlainPolicy.load(tmp_path / "s.safetensors")
+
+
+@pytest.mark.parametrize("activation", ACTIVATIONS)
+def test_in_eight_bits_it_is_a_quarter_and_nearly_the_same(activation):
+    student = make((64, 64), activation)
+    rows = np.array([5.0, 0, 0]) + np.random.default_rng(0).standard_normal((400, 3))
+    rows = rows.astype(np.float32)
+    data = export(student, rows, {"a": "b"}, "student.int8.onnx")
+    whole = export(student, rows, {"a": "b"}, "student.onnx")
+    assert len(data) < 0.6 * len(whole)  # of 64 x 64, whose scales and nodes take their part
+    session = onnxruntime.InferenceSession(data)
+    (answers,) = session.run(["actions"], {"obs": rows})
+    assert 0 < np.abs(answers - student.act(rows)).mean() < 0.1
+    assert data == export(student, rows, {"a": "b"}, "student.int8.onnx")
+
+
+def test_what_eight_bits_can_not_hold_is_refused():
+    student = make((8, 8), "relu", low=(-np.inf, -np.inf), high=(np.inf, np.inf))
+    with torch.no_grad():
+        student.network[4].weight.mul_(1000)  # of actions in units of 1
+    rows = 50 * np.random.default_rng(0).standard_normal((200, 3)).astype(np.float32)
+    with pytest.raises(ExportError, match="in int8"):
+        export(student, rows, {}, "student.int8.onnx")

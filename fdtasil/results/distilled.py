@@ -102,8 +102,9 @@ class Distilled:
 
         Args:
             path: Ends with ".onnx" (input `obs` (batch, n), output `actions`, normaliser and
-                action bounds inside; `metadata_props` says the rest), ".safetensors", ".c" (C99
-                without malloc; `-DSTUDENT_MAIN` makes it a program of lines) or ".h", its header.
+                action bounds inside; `metadata_props` says the rest), ".int8.onnx", ".safetensors",
+                ".c" (C99 without malloc; `-DSTUDENT_MAIN` makes it a program of lines) or ".h",
+                its header.
                 Where actions are choices, the ONNX file has the outputs `scores` and `actions`.
                 ".py" is a program that needs numpy alone, and opens the ".safetensors".
             inputs: "flat", or "keys" for an ONNX file with one input for each part of a

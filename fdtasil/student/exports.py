@@ -11,6 +11,7 @@ from fdtasil.errors import ExportError, SettingError
 from fdtasil.files.onnx.export import check_finite, export_module
 from fdtasil.student import plain
 from fdtasil.student.c_source import c_header, c_source, check_parity
+from fdtasil.student.int8 import as_int8
 from fdtasil.student.own_form import own_form
 from fdtasil.student.plain import PlainPolicy
 from fdtasil.student.policy import Student
@@ -35,6 +36,12 @@ def _onnx(
 
 def _onnx_with_keys(student: Student, states: np.ndarray, metadata: Mapping[str, str]) -> bytes:
     return _onnx(student, states, metadata, keys=True)
+
+
+def _int8(student: Student, states: np.ndarray, metadata: Mapping[str, str]) -> bytes:
+    chooses = student.spaces is not None and student.spaces.actions.choices
+    output = "scores" if chooses else "actions"
+    return as_int8(_onnx(student, states, metadata), student, states, output)
 
 
 def _safetensors(student: Student, states: np.ndarray, metadata: Mapping[str, str]) -> bytes:
@@ -71,13 +78,14 @@ def _py(student: Student, states: np.ndarray, metadata: Mapping[str, str]) -> by
 
 
 EXPORTS: dict[str, Writer] = {
+    ".int8.onnx": _int8,
     ".onnx": _onnx,
     ".safetensors": _safetensors,
     ".c": _c,
     ".h": _h,
     ".py": _py,
 }
-"""Every target by the suffix of its file."""
+"""Every target by the suffix of its file; the first that fits."""
 
 
 def export(
@@ -100,8 +108,8 @@ def export(
         SettingError: If there is no such target, or it has one input.
         ExportError: If the file's answers differ from the student's by more than 1e-5.
     """
-    suffix = Path(name).suffix
-    if suffix not in EXPORTS:
+    suffix = next((suffix for suffix in EXPORTS if str(name).endswith(suffix)), None)
+    if suffix is None:
         raise SettingError(
             f"{str(name)!r} to export a student to",
             f"a name that ends with {' or '.join(EXPORTS)}",
