@@ -28,6 +28,7 @@ from fdtasil.results.evaluation import Evaluation
 from fdtasil.results.figures import FIGURES
 from fdtasil.results.page import result_html
 from fdtasil.student.exports import export
+from fdtasil.student.into_sb3 import agent_of
 from fdtasil.student.policy import Student
 from fdtasil.student.view import StudentObservation, Unseen, View
 
@@ -102,9 +103,9 @@ class Distilled:
 
         Args:
             path: Ends with ".onnx" (input `obs` (batch, n), output `actions`, normaliser and
-                action bounds inside; `metadata_props` says the rest), ".int8.onnx", ".safetensors",
-                ".c" (C99 without malloc; `-DSTUDENT_MAIN` makes it a program of lines) or ".h",
-                its header.
+                action bounds inside; `metadata_props` says the rest), ".int8.onnx",
+                ".safetensors", ".c" (C99 without malloc; `-DSTUDENT_MAIN` makes it a program of
+                lines) or ".h", its header.
                 Where actions are choices, the ONNX file has the outputs `scores` and `actions`.
                 ".py" is a program that needs numpy alone, and opens the ".safetensors".
             inputs: "flat", or "keys" for an ONNX file with one input for each part of a
@@ -123,6 +124,23 @@ class Distilled:
         """Write the student as one ONNX file, whatever its name; see `export`."""
         write_bytes(Path(path), self.export_bytes("student.onnx"))
         return Path(path)
+
+    def to_sb3(self, env: Any, algorithm: str = "SAC", seed: int = 0) -> Any:
+        """Return an agent of stable-baselines3 that acts as the student, to be trained on.
+
+        Its critics are fresh: let them learn before the actor does (`learning_starts`).
+
+        Args:
+            env: A gymnasium id or environment.
+            algorithm: "SAC" or "TD3" where actions are numbers with bounds, "PPO" where they are
+                choices.
+            seed: Of the agent.
+
+        Raises:
+            SettingError: If there is no such algorithm.
+            ExportError: If the student is no actor of it.
+        """
+        return agent_of(self.student, env, algorithm, seed)
 
     def export_bytes(self, name: str | Path, inputs: str = "flat") -> bytes:
         """Return what `export` writes to a file of that name."""

@@ -3,10 +3,7 @@
 import importlib
 import io
 import pickle
-import random
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -18,6 +15,7 @@ from torch import Tensor, nn
 from fdtasil.errors import ExpertError, first_line
 from fdtasil.experts.sb3.archive import Archive
 from fdtasil.experts.sb3.network import Clip, ObservationStatistics, Rescale
+from fdtasil.experts.sb3.randomness import randomness_kept
 from fdtasil.experts.sb3.recipes import Recipe, has_usual_policy
 from fdtasil.experts.sb3.spaces import Bounds, read_bounds
 
@@ -136,7 +134,7 @@ def _replaced(
 
 def _load(algorithm: Any, archive: Archive, replaced: dict[str, Any]) -> "BaseAlgorithm":
     try:
-        with _randomness_kept(), warnings.catch_warnings():
+        with randomness_kept(), warnings.catch_warnings():
             warnings.simplefilter("ignore")
             return algorithm.load(
                 io.BytesIO(archive.content), device="cpu", custom_objects=replaced
@@ -169,18 +167,6 @@ def _check_predict(model: "BaseAlgorithm", module: nn.Module) -> None:
             "the scaling or clipping of stable-baselines3, and nothing else",
             "load it yourself, and pass the agent: distill(agent, env)",
         )
-
-
-@contextmanager
-def _randomness_kept() -> Iterator[None]:
-    """Undo the seeding of all global generators that loading an agent does."""
-    plain, numbers = random.getstate(), np.random.get_state()
-    try:
-        with torch.random.fork_rng(devices=[]):
-            yield
-    finally:
-        random.setstate(plain)
-        np.random.set_state(numbers)
 
 
 def _zero(_: float) -> float:

@@ -1,0 +1,109 @@
+"""A student inside an agent of stable-baselines3, to go on by reinforcement learning."""
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import nn
+
+from fdtasil.checks import check_choice, check_count
+from fdtasil.errors import ExportError
+from fdtasil.experts.sb3.randomness import randomness_kept
+from fdtasil.student.architectures import ACTIVATIONS, Mlp
+from fdtasil.student.policy import Student
+
+__all__ = ["ALGORITHMS", "agent_of"]
+
+Layers = list[tuple[torch.Tensor, torch.Tensor]]
+
+
+def _sac(policy: Any) -> Sequence[nn.Linear]:
+    return [*_linear(policy.actor.latent_pi), policy.actor.mu]
+
+
+def _td3(policy: Any) -> Sequence[nn.Linear]:
+    return _linear(policy.actor.mu)
+
+
+def _ppo(policy: Any) -> Sequence[nn.Linear]:
+    return [*_linear(policy.mlp_extractor.policy_net), policy.action_net]
+
+
+ALGORITHMS: dict[str, tuple[Callable[[Any], Sequence[nn.Linear]], bool]] = {
+    "SAC": (_sac, False),
+    "TD3": (_td3, False),
+    "PPO": (_ppo, True),
+}
+"""Where each keeps its actor's layers, and whether it takes choices (else bounded numbers): the
+tanh and the bounds of a student are those of SAC and TD3, and PPO has none."""
+
+
+def agent_of(student: Student, env: Any, algorithm: str, seed: int) -> Any:
+    """Return an agent whose actor is the student; its critics are fresh.
+
+    The student's normaliser goes into the first layer, so the agent takes raw observations.
+
+    Args:
+        student: The student, of numbers with bounds, or of choices for "PPO".
+        env: A gymnasium id or environment, as stable-baselines3 takes it.
+        algorithm: "SAC", "TD3", or "PPO".
+        seed: Of the agent.
+
+    Raises:
+        SettingError: If there is no such algorithm.
+        ExportError: If the student is no actor of it.
+    """
+    layers_of, chooses = ALGORITHMS[check_choice("algorithm", algorithm, ALGORITHMS)]
+    network, layers = student.architecture, _folded(student)
+    choices = bool(student.spaces is not None and student.spaces.actions.choices)
+    bounded = bool(torch.isfinite(student.low).all() and torch.isfinite(student.high).all())
+    flat = student.spaces is None or student.spaces.observations.plain
+    good = isinstance(network, Mlp) and flat and (choices if chooses else bounded)
+    if not good or layers is None or not isinstance(network, Mlp):
+        kind = "choices" if choices else "numbers with bounds" if bounded else "unbounded numbers"
+        raise ExportError(
+            f"a student of {kind} as an actor of {algorithm}",
+            "an Mlp on flat observations, with bounded numbers for SAC and TD3, choices for PPO",
+            'take "PPO"' if choices else "go on with the student's own weights",
+        )
+    import stable_baselines3
+
+    widths = list(network.hidden) if isinstance(network.hidden, tuple) else [network.hidden]
+    arch: Any = {"pi": widths, "vf": widths} if chooses else widths
+    settings = {"net_arch": arch, "activation_fn": type(ACTIVATIONS[network.activation]())}
+    with randomness_kept():
+        agent = getattr(stable_baselines3, algorithm)(
+            "MlpPolicy",
+            env,
+            policy_kwargs=settings,
+            seed=check_count("seed", seed, 0, 2**32 - 1),
+            device="cpu",
+        )
+    with torch.no_grad():
+        for mine, (weight, bias) in zip(layers_of(agent.policy), layers, strict=True):
+            mine.weight.copy_(weight)
+            mine.bias.copy_(bias)
+        if algorithm == "TD3":
+            agent.policy.actor_target.load_state_dict(agent.policy.actor.state_dict())
+    return agent
+
+
+def _folded(student: Student) -> Layers | None:
+    """Return weights and biases on raw observations, for actions in -1..1 before their tanh."""
+    if not isinstance(student.network, nn.Sequential):
+        return None
+    linear = _linear(student.network)
+    first, *rest = ((one.weight.detach(), one.bias.detach()) for one in linear)
+    weight = first[0] / student.scale
+    bias = first[1] - (weight.double() @ student.mean.double()).float()
+    layers = [(weight, bias), *rest]
+    if student.spaces is not None and student.spaces.actions.choices:
+        # Scores in units of their own; the logits of a distribution are these.
+        half, centre = student.action_units, torch.zeros_like(student.action_units)
+        weight, bias = layers[-1]
+        layers[-1] = weight * half[:, None], bias * half + centre
+    return layers
+
+
+def _linear(network: Any) -> list[nn.Linear]:
+    return [layer for layer in network if isinstance(layer, nn.Linear)]
