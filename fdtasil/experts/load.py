@@ -19,11 +19,13 @@ from fdtasil.experts.c_expert import open_c
 from fdtasil.experts.expert import CHUNK, Expert, Hints
 from fdtasil.experts.http_expert import is_http_url, open_http
 from fdtasil.experts.hub import fetch, is_hub_uri
+from fdtasil.experts.memory import Memory, stateless
 from fdtasil.experts.modules import ask_as_it_is, open_module
 from fdtasil.experts.onnx_expert import open_onnx
 from fdtasil.experts.own_jacobian import own_jacobian
 from fdtasil.experts.predicting import open_predictor
 from fdtasil.experts.sb3.agent import read_agent
+from fdtasil.experts.sb3.recurrent import RecurrentNetwork
 from fdtasil.experts.sb3.trust import Trust
 from fdtasil.experts.silence import Silence
 from fdtasil.experts.sizes import size_hint
@@ -262,6 +264,17 @@ def _from_hub(uri: str | Path, hints: Hints) -> Expert:
 
 def _from_agent(path: str | Path, hints: Hints) -> Expert:
     agent = read_agent(path, trust=None if hints.trust == "c" else hints.trust)
+    if isinstance(agent.module, RecurrentNetwork):
+        n, step = agent.observation_size, agent.module.step
+        return Expert(
+            stateless(step, n),
+            Path(path).name,
+            n + agent.memory,
+            len(agent.action_low),
+            agent.sha256,
+            source=str(path),
+            memory=Memory(agent.memory, step),
+        )
     return dataclasses.replace(
         ask_as_it_is(agent.module),
         name=Path(path).name,

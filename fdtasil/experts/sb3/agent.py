@@ -17,6 +17,12 @@ from fdtasil.experts.sb3.network import (
     build_network,
 )
 from fdtasil.experts.sb3.recipes import Recipe, check_policy, find_recipe, read_activation
+from fdtasil.experts.sb3.recurrent import (
+    RECURRENT,
+    RecurrentNetwork,
+    is_recurrent,
+    read_lstm,
+)
 from fdtasil.experts.sb3.spaces import (
     Bounds,
     choice_sizes,
@@ -40,7 +46,8 @@ class Agent:
     """A trained agent of stable-baselines3.
 
     Attributes:
-        algorithm: "SAC", "TD3", "DDPG", "TQC", "PPO", "A2C", "TRPO", "DQN" or "QRDQN".
+        algorithm: "SAC", "TD3", "DDPG", "TQC", "PPO", "A2C", "TRPO", "DQN", "QRDQN" or
+            "RecurrentPPO".
         observation_size: n.
         action_low: (m,) float32, lower action bounds in environment units; scores have none.
         action_high: (m,) float32, upper bounds.
@@ -51,6 +58,8 @@ class Agent:
         sha256: Of the zip.
         library_version: Version of stable-baselines3 that wrote it, or "unknown".
         statistics_sha256: Of the VecNormalize file whose statistics are in `module`, or None.
+        memory: k, how many numbers it carries along an episode; the module then takes
+            (B, n) observations and (B, k) memories, and returns both. 0 for none.
     """
 
     algorithm: str
@@ -62,6 +71,7 @@ class Agent:
     sha256: str
     library_version: str
     statistics_sha256: str | None
+    memory: int = 0
 
 
 @reads(
@@ -83,7 +93,8 @@ def read_agent(
 
     Args:
         path: The zip of a SAC, TD3, DDPG, TQC, PPO, A2C, TRPO, DQN or QR-DQN agent with an MLP
-            policy; its ".zip" may be left out, as in stable-baselines3.
+            policy, or of a RecurrentPPO with an LSTM before one; its ".zip" may be left out, as in
+            stable-baselines3.
         trust: "pickle" to have stable-baselines3 load what can't be read otherwise: gSDE, custom
             policies, feature extractors and activations, and the statistics of VecNormalize. That
             runs any code that is in such a file.
@@ -112,9 +123,24 @@ def read_agent(
     n, m = (
         read_size(archive.record, f"{kind}_space", str(path)) for kind in ("observation", "action")
     )
-    recipe = find_recipe(archive.record, str(path))
     given = given_bounds(action_low, action_high, m)
     statistics, statistics_sha256 = read_statistics(path, vecnormalize, n, trust)
+    if is_recurrent(archive.record):
+        before = nn.Identity() if statistics is None else Normalise(statistics)
+        module, bounds = _recurrent(archive, (n, m), given, before)
+        return Agent(
+            RECURRENT.algorithm,
+            n,
+            bounds.low,
+            bounds.high,
+            module.eval().requires_grad_(False),
+            path,
+            archive.sha256,
+            archive.library_version(),
+            statistics_sha256,
+            module.memory_size,
+        )
+    recipe = find_recipe(archive.record, str(path))
     network, squashed, bounds = _read_network(archive, recipe, (n, m), given, trust)
     _check_bounds(bounds, squashed, str(path))
     parts: list[nn.Module] = [network]
@@ -182,6 +208,19 @@ def _rebuilt(
     if each > 1:
         network.append(MeanOfQuantiles(each))
     return network, False, no_bounds(m)
+
+
+def _recurrent(
+    archive: Archive, sizes: tuple[int, int], given: Bounds | None, before: nn.Module
+) -> tuple[RecurrentNetwork, Bounds]:
+    source, (n, m) = str(archive.path), sizes
+    activation, weights = read_activation(archive.record, RECURRENT, source), archive.weights()
+    lstm = read_lstm(weights, n, source)
+    after = build_network(weights, RECURRENT, activation, (lstm.hidden_size, m), source)
+    if choice_sizes(archive.record):
+        return RecurrentNetwork(before, lstm, after), no_bounds(m)
+    bounds = given or read_bounds(archive.record, m, source)
+    return RecurrentNetwork(before, lstm, nn.Sequential(after, Clip(bounds))), bounds
 
 
 def _quantiles(archive: Archive, recipe: Recipe) -> int:

@@ -8,7 +8,7 @@ import torch
 from numpy.typing import ArrayLike
 
 from fdtasil.compute import ask_module
-from fdtasil.errors import ExpertError, SettingError
+from fdtasil.errors import ExpertError, ExportError, SettingError
 from fdtasil.experts.sb3.agent import Agent, read_agent
 from fdtasil.experts.sb3.statistics import VecNormalizePath
 from fdtasil.experts.sb3.trust import Trust
@@ -74,6 +74,12 @@ def export_sb3(
         action_low=action_low,
         action_high=action_high,
     )
+    if agent.memory:
+        raise ExportError(
+            f"{agent.source}, which has a memory of {agent.memory} numbers, as one ONNX file",
+            "an agent whose answer depends on the observation alone",
+            'pass the zip itself: distill("agent.zip", env, history=3)',
+        )
     _check_out(Path(out), agent.source)
     states, where = _random_states(agent) if env is None else _visited_states(agent, env)
     metadata = {**_metadata(agent), "compared_on": f"{len(states)} {where}"}

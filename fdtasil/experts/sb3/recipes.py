@@ -138,6 +138,7 @@ _HARMLESS = {
     *("clip_mean", "device", "features_extractor_kwargs", "full_std", "log_std_init", "n_critics"),
     *("n_quantiles", "net_arch", "normalize_images", "optimizer_class", "optimizer_kwargs"),
     *("ortho_init", "sde_net_arch", "share_features_extractor", "use_expln"),
+    *("enable_critic_lstm", "lstm_hidden_size", "n_lstm_layers", "shared_lstm"),
 }
 # Policies that are not read, trusted or not, and what to do instead.
 FLATTENED = (
@@ -152,7 +153,7 @@ _UNFIT = {
         "a policy on dictionaries of observations",
         FLATTENED,
     ),
-    r"sb3_contrib\..*recurrent": ("a policy with memory", _TRAIN),
+    r"sb3_contrib\..*recurrent.*(Cnn|MultiInput)": ("a policy with memory on images", _TRAIN),
     r"sbx\.": ("a policy of sbx, whose weights are JAX's", _ITSELF),
     r"stable_baselines\.": ("a policy of stable-baselines 2, of TensorFlow", _ITSELF),
 }
