@@ -40,6 +40,7 @@ if TYPE_CHECKING:
     from fdtasil.results.distilled import Distilled
     from fdtasil.results.evaluation import Evaluation
     from fdtasil.rollouts.wanted import Environment
+    from fdtasil.run.diagnosing import diagnose
     from fdtasil.run.events import Event, Log
     from fdtasil.run.film import render
     from fdtasil.run.pipeline import distill, evaluate
@@ -68,6 +69,7 @@ __all__ = [
     "Probes",
     "Student",
     "__version__",
+    "diagnose",
     "distill",
     "evaluate",
     "from_arrays",
@@ -93,6 +95,7 @@ _ROOMS = {
     "results.distilled": ("Distilled",),
     "results.evaluation": ("Evaluation",),
     "rollouts.wanted": ("Environment",),
+    "run.diagnosing": ("diagnose",),
     "run.events": ("Event", "Log"),
     "run.film": ("render",),
     "run.pipeline": ("distill", "evaluate"),

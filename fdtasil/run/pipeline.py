@@ -13,11 +13,10 @@ from fdtasil.demonstrations.trainers import Trainer
 from fdtasil.errors import SettingError, heard_warnings
 from fdtasil.experts.carrying import carry
 from fdtasil.experts.examination import check_first, examine
-from fdtasil.experts.expert import Expert, Hints
+from fdtasil.experts.expert import Expert
 from fdtasil.experts.gate import GATE_STATES, compare_again, large_batch
-from fdtasil.experts.load import ExpertLike, expert_in, open_expert, sized
+from fdtasil.experts.load import ExpertLike, expert_in, sized
 from fdtasil.experts.silence import Silence
-from fdtasil.experts.structure import in_spaces
 from fdtasil.probes.source import Probes
 from fdtasil.probes.spread import SpreadLike
 from fdtasil.progress import Progress
@@ -28,7 +27,6 @@ from fdtasil.rollouts.behaviours import follow, follow_answers
 from fdtasil.rollouts.environments import EnvironmentLike, EnvironmentPool, resolve_horizon
 from fdtasil.rollouts.episodes import Episodes
 from fdtasil.rollouts.history import past_size
-from fdtasil.rollouts.spaces import Spaces, flat_layout
 from fdtasil.run.account import Account
 from fdtasil.run.arguments import read_arguments
 from fdtasil.run.asking import Asking
@@ -39,6 +37,7 @@ from fdtasil.run.doubts import warn_of_misfit, warn_of_silence
 from fdtasil.run.events import Callback, Event, tell_all
 from fdtasil.run.folder import asked_anew, open_run_folder
 from fdtasil.run.interrupts import heard_interrupts
+from fdtasil.run.judging import judged_in
 from fdtasil.run.lesson import Lesson
 from fdtasil.run.report import config_of, no_answer, report_of
 from fdtasil.run.rounds import Rounds
@@ -276,7 +275,7 @@ def evaluate(
         black_box, length = expert_in(expert, pool), resolve_horizon(horizon, pool)
         student_obs = named(student_obs, pool.spaces.observations)
         seen_size = view_size(student_obs, n + past_size(history, n, m))
-        judged = _judged(policy, pool, seen_size, whole=student_obs is None and history == 1)
+        judged = judged_in(policy, pool, seen_size, whole=student_obs is None and history == 1)
         if judged.memory is not None:
             raise SettingError(
                 f"{judged.name}, which has a memory, to be judged",
@@ -295,15 +294,6 @@ def evaluate(
         acting = follow_answers(answer)
         own = n - past - remembered
         return evaluate_pair(acting, black_box, theirs, pool, length, seed, bars, limits, own)
-
-
-def _judged(policy: ExpertLike, pool: EnvironmentPool, size: int | None, *, whole: bool) -> Expert:
-    """Open a policy that is judged; one that sees a part of the observation takes flat rows."""
-    spaces = None if pool.spaces.plain else pool.spaces
-    judged = open_expert(policy, Hints(size, pool.boxes.action_size, spaces=spaces))
-    if spaces is not None and (not whole or judged.columns is not None):
-        spaces = Spaces(flat_layout(size or 1), spaces.actions)
-    return in_spaces(judged, spaces)
 
 
 def check_history(history: object, student_obs: object) -> int:

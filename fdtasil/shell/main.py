@@ -17,6 +17,7 @@ COMMANDS = {
     "inspect": "what an expert is: its contract with the environment, and its return",
     "distill": "an expert into a small torch policy that reacts as it does",
     "evaluate": "a policy beside an expert, from the same starts",
+    "diagnose": "a student's derivatives beside its expert's, and what the expert forgives",
     "gains": "the Jacobian of an expert that does not give it, with its error",
     "shrink": "the smallest student that keeps the expert's level",
     "report": "everything that a run knows, on one page",

@@ -1,0 +1,39 @@
+"""`fdtasil diagnose`: how well a student's derivatives are its expert's."""
+
+from typing import Any
+
+from fdtasil.run.diagnosing import diagnose
+from fdtasil.shell.call import wanted
+from fdtasil.shell.command import EnvironmentId, Flags, PolicyPath, as_command, import_module_of
+
+__all__ = ["command"]
+
+
+def _diagnose(
+    student: str,
+    expert: str,
+    env: str,
+    env_kwargs: str | None,
+    reset_options: str | None,
+    **arguments: Any,
+) -> None:
+    import_module_of(env)
+    place = wanted(env, env_kwargs, reset_options)
+    assert place is not None
+    print(diagnose(student, expert, place, **arguments))
+
+
+command = as_command(
+    _diagnose,
+    [
+        Flags(
+            diagnose,
+            without=("progress",),
+            types={"student": PolicyPath, "env": EnvironmentId, "expert": str},
+        )
+    ],
+    {
+        "env_kwargs": (str | None, None, "What the environment is made with, as JSON."),
+        "reset_options": (str | None, None, "What each reset is given as its options, as JSON."),
+    },
+)
