@@ -67,7 +67,7 @@ def test_one_that_forgives_less_asks_for_a_higher_order(nu, order):
 
     That is where a path that comes to rest from one side meets one that is pushed to the other.
     """
-    found = measured(nu, (3e-3, 1e-2, 3e-2), 1500)
+    found = measured(nu, (1e-4, 3e-4, 1e-3), 4000)
     assert found.exponent == pytest.approx(nu, rel=0.1)
     assert STIFFNESS**-nu < found.constant < 2 ** (1 - nu) * STIFFNESS**-nu
     assert found.order == order

@@ -21,7 +21,7 @@ from fdtasil.rollouts.rollout import rollout
 __all__ = ["Stability", "distances", "stability_of"]
 
 SIZES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
-_FAR = 1.0  # deviations: farther apart two paths have nothing to do with each other
+_FAR = 0.3  # deviations: farther apart two paths begin to have nothing to do with each other
 _NEAR = 1e-5  # what float32 leaves of a path
 _RESAMPLES = 500
 _HIGHEST = 9  # order beyond which nobody asks
