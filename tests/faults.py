@@ -226,6 +226,18 @@ FAULTS = {
         211: "compiled code with static buffers, asked by several threads",
         212: "a machine of a cluster that is lost with a batch",
     },
+    "spaces and vector environments": {
+        213: "an observation that is not what its space promises",
+        214: "a space that has no flat form",
+        215: "an answer in another form than the actions, or a choice that there is not",
+        216: "a vector environment that resets itself, takes one seed, or gives tensors",
+        217: "a normaliser around a vector environment that goes on learning",
+        218: "noise on choices",
+        219: "an LSTM whose weights are damaged",
+        220: "a law that switches, probed too near",
+        221: "texts of a run that would be code on a page",
+        222: "a file in eight bits that is another policy",
+    },
 }
 
 LEFT_OUT: dict[int, str] = {}

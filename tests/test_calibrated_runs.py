@@ -42,6 +42,7 @@ def test_an_open_source_is_completed(regime, stencil, radius):
     assert result.report["predicted_queries"]["probe"] == rows
 
 
+@pytest.mark.fault(220)
 @pytest.mark.parametrize("dead_zone", [0.0, 0.1])
 def test_a_law_that_switches_is_asked_far_and_wide(dead_zone):
     """Near a state nothing changes: what is learnt there is nothing."""

@@ -64,6 +64,7 @@ def test_who_only_chooses_has_ones_for_scores(pool):
     )
 
 
+@pytest.mark.fault(215)
 @pytest.mark.parametrize(
     "answer",
     [
@@ -129,6 +130,7 @@ def test_several_choices(tmp_path):
     assert np.array_equal(session.run(["actions"], {"obs": rows})[0], chosen)
 
 
+@pytest.mark.fault(218)
 @pytest.mark.parametrize("trainer", ["dart", "noise"])
 def test_noise_on_choices_is_refused(trainer):
     with pytest.raises(SettingError, match="choices"):

@@ -43,6 +43,7 @@ def test_the_page_has_everything_and_asks_nobody(quick):
         assert told in text
 
 
+@pytest.mark.fault(221)
 def test_texts_of_a_file_stay_texts(spoilt):
     assert "script" not in Tags(page_of(spoilt)).found
     assert "script" not in Tags(spoilt._repr_html_()).found

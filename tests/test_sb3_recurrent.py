@@ -74,6 +74,7 @@ def test_choices_with_a_memory(tmp_path):
     assert np.array_equal(read_along(read, rows).argmax(-1), played(agent, rows))
 
 
+@pytest.mark.fault(219)
 def test_damaged_weights_are_refused(tmp_path):
     path = save_agent(tmp_path, recurrent())
     with pytest.raises(ExpertError, match="LSTM"):

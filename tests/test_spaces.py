@@ -213,6 +213,7 @@ def test_resuming_needs_the_same_spaces(tmp_path):
     assert resumed.student.to_bytes() == whole.student.to_bytes()
 
 
+@pytest.mark.fault(214)
 @pytest.mark.parametrize(
     "space",
     [
@@ -235,6 +236,7 @@ def test_spaces_without_a_flat_form_are_refused(space, role):
         fdtasil.distill(law, Odd, 0, **QUICK)
 
 
+@pytest.mark.fault(213)
 @pytest.mark.parametrize(
     ("change", "found"),
     [
@@ -255,6 +257,7 @@ def test_an_observation_that_breaks_its_promise(change, found):
         fdtasil.distill(in_form(law, "dictionary"), lambda: Breaks("dictionary"), 0, **QUICK)
 
 
+@pytest.mark.fault(215)
 @pytest.mark.parametrize(
     ("answer", "found"),
     [
