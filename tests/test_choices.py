@@ -232,3 +232,25 @@ def test_stable_baselines3_evaluates_a_student():
     environment = Monitor(gymnasium.make("CartPole-v1"))
     mean, _ = evaluate_policy(result.student, environment, n_eval_episodes=2, warn=False)
     assert mean > 50
+
+
+def test_a_history_of_choices_is_what_was_chosen():
+    """As the environment showed it in training, so `History` keeps it where the student runs."""
+    options = {**QUICK, "history": 2, "episodes": 3}
+    result = distilled(scores, **options)
+    rows = result.demonstrations.observations
+    states = result.demonstrations
+    assert rows.shape[1] == 5 + 5 + 4
+    done = rows[states.episode == 0][1:, 10:]
+    chosen = states.actions[states.episode == 0][:-1].argmax(1)
+    assert np.array_equal(done, np.eye(4)[chosen])
+    policy = fdtasil.History(result.student, 2)
+    environment = InForm("box", "choice")
+    seen, _ = environment.reset(seed=0)
+    before = np.zeros(9)
+    for step in range(5):
+        action, _ = policy.predict(seen, episode_start=step == 0)
+        flat = result.student.act(np.append(seen, before)[None].astype(np.float32))[0]
+        assert action == 1 + flat.argmax()
+        before = np.append(seen, np.eye(4)[flat.argmax()])
+        seen, *_ = environment.step(action)

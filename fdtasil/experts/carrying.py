@@ -42,7 +42,8 @@ def carry(
     n, m = pool.boxes.observation_size, pool.boxes.action_size
     past, remembered = past_size(history, n, m), memory.size if memory else 0
     if past:
-        pool.wrap(lambda environment: WithHistory(environment, history))
+        layout = pool.spaces.actions
+        pool.wrap(lambda environment: WithHistory(environment, history, layout))
         columns = (*range(n), *range(n + past, n + past + remembered))
         module = expert.module and OnColumns(expert.module, columns)
         size = n + past + remembered

@@ -5,6 +5,8 @@ from typing import Any
 import gymnasium
 import numpy as np
 
+from fdtasil.rollouts.spaces import Layout
+
 __all__ = ["Window", "WithHistory", "past_size"]
 
 
@@ -45,10 +47,12 @@ class WithHistory(gymnasium.Wrapper):
     Args:
         env: The environment; its observations and actions are boxes (n,) and (m,).
         history: H, how many observations are seen.
+        layout: Of the actions, whose choices are remembered as what was chosen.
     """
 
-    def __init__(self, env: gymnasium.Env, history: int) -> None:
+    def __init__(self, env: gymnasium.Env, history: int, layout: Layout) -> None:
         super().__init__(env)
+        self._layout = layout
         box, actions = env.observation_space, env.action_space
         assert isinstance(box, gymnasium.spaces.Box), "the pool has looked at its spaces"
         assert isinstance(actions, gymnasium.spaces.Box)
@@ -67,7 +71,7 @@ class WithHistory(gymnasium.Wrapper):
 
     def step(self, action: Any) -> tuple[np.ndarray, Any, bool, bool, Any]:
         """Remember what was observed and done."""
-        self._window.push(self._seen, np.asarray(action))
+        self._window.push(self._seen, self._layout.done(np.asarray(action)))
         observation, *rest = self.env.step(action)
         self._seen = np.array(observation)
         return self._window.behind(self._seen), *rest  # pyright: ignore[reportReturnType]

@@ -244,6 +244,16 @@ class Layout:
         """Return (B, c), which score of each choice is the best."""
         return np.stack([rows[:, a:b].argmax(axis=1) for a, b in self.choices], axis=1)
 
+    def done(self, row: np.ndarray) -> np.ndarray:
+        """Return (m,) what was done by an action: of a choice a one for the best score."""
+        if not self.choices:
+            return row
+        done = np.array(row, np.float64)
+        for start, end in self.choices:
+            best = int(done[start:end].argmax())
+            done[start:end] = np.arange(end - start) == best
+        return done
+
     def centred(self, rows: np.ndarray) -> np.ndarray:
         """Return rows with scores that sum to zero: a number added to all changes no choice."""
         for start, end in self.choices:

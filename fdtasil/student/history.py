@@ -63,6 +63,10 @@ class History:
         if episode_start:
             self._window.clear()
         seen = np.asarray(observation, np.float32)
-        action, _ = self._student.predict(self._window.behind(seen))
-        self._window.push(seen, action)
-        return action, None
+        rows = self._window.behind(seen)[None].astype(np.float32)
+        action, spaces = self._student.answer(rows)[0], self._student.spaces
+        if spaces is None:
+            self._window.push(seen, action)
+            return action, None
+        self._window.push(seen, spaces.actions.done(action))
+        return spaces.actions.value(action), None

@@ -180,10 +180,11 @@ class Student(nn.Module):
                 f"({n},) or (B, {n})",
                 "pass raw observations",
             )
-        actions = self._answered(np.atleast_2d(rows))
+        actions = self.answer(np.atleast_2d(rows))
         return (actions[0] if rows.ndim == 1 else actions), state
 
-    def _answered(self, rows: np.ndarray) -> np.ndarray:
+    def answer(self, rows: np.ndarray) -> np.ndarray:
+        """Answer as `act` does, in numpy where that is quicker: (B, n) -> (B, m)."""
         # Torch takes longer to begin than the numbers of one row take.
         plain = self.plain if len(rows) == 1 else None
         return self.act(rows) if plain is None else plain(rows)
@@ -198,7 +199,7 @@ class Student(nn.Module):
                 f"what the environment gives{f': {names}' if names else ''}, or flat rows",
                 "pass raw observations",
             ) from None
-        actions = self._answered(rows)
+        actions = self.answer(rows)
         return spaces.actions.value(actions[0]) if one else spaces.actions.values(actions)
 
     def to_bytes(self, metadata: Mapping[str, str] | None = None) -> bytes:
