@@ -23,6 +23,7 @@ __all__ = [
     "OptionalExpert",
     "OptionalText",
     "PolicyPath",
+    "RunFolder",
     "as_command",
     "import_module_of",
 ]
@@ -33,6 +34,7 @@ OptionalText = Annotated[str | None, tyro.conf.arg(metavar="TEXT")]
 PolicyPath = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="POLICY")]
 AgentPath = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="AGENT.zip")]
 ExpertPath = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="EXPERT")]
+RunFolder = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
 EnvironmentId = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ENV")]
 
 _METAVARS: dict[Any, str] = {tuple: "INT [INT ...]", int: "INT", float: "FLOAT", Path: "PATH"}

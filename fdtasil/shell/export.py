@@ -6,10 +6,10 @@ from typing import Annotated
 import tyro
 
 from fdtasil.results.distilled import Distilled
+from fdtasil.shell.command import RunFolder
 
 __all__ = ["command"]
 
-RunFolder = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
 OutFile = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="FILE")]
 
 

@@ -1,17 +1,13 @@
 """`fdtasil report`: a run on one page."""
 
 from pathlib import Path
-from typing import Annotated
-
-import tyro
 
 from fdtasil.files.storage import write_bytes
 from fdtasil.results.distilled import Distilled
 from fdtasil.results.page import page_of
+from fdtasil.shell.command import RunFolder
 
 __all__ = ["command"]
-
-RunFolder = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
 
 
 def command(run: RunFolder, /, *, out: Path | None = None) -> None:

@@ -1,17 +1,12 @@
 """`fdtasil shrink`: students of several sizes from one run's answers."""
 
 from pathlib import Path
-from typing import Annotated
-
-import tyro
 
 from fdtasil.run.shrinking import shrink
 from fdtasil.shell.call import wanted
-from fdtasil.shell.command import EnvironmentId, ExpertPath, import_module_of
+from fdtasil.shell.command import EnvironmentId, ExpertPath, RunFolder, import_module_of
 
 __all__ = ["command"]
-
-RunFolder = Annotated[Path, tyro.conf.Positional, tyro.conf.arg(metavar="RUN")]
 
 
 def command(
