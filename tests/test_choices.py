@@ -254,3 +254,29 @@ def test_a_history_of_choices_is_what_was_chosen():
         assert action == 1 + flat.argmax()
         before = np.append(seen, np.eye(4)[flat.argmax()])
         seen, *_ = environment.step(action)
+
+
+def test_a_module_that_chooses():
+    class Chooses(torch.nn.Module):
+        def forward(self, rows):
+            return torch.from_numpy(scores(rows.numpy())).argmax(1) + 1
+
+    result = distilled(Chooses())
+    assert np.array_equal(
+        result.demonstrations.actions.argmax(1),
+        scores(result.demonstrations.observations).argmax(1),
+    )
+
+
+def test_yes_and_no_of_an_agent():
+    class Switches(InForm):
+        def __init__(self):
+            super().__init__("box", "choices")
+            self.action_space = gymnasium.spaces.MultiBinary(2)
+
+    agent = shake(fresh_agent("PPO", Switches(), {}))
+    rows = rows_of()
+    with EnvironmentPool(Switches) as pool:
+        found = expert_in(agent, pool).ask(rows, "check")
+        best = pool.spaces.actions.best(found)
+    assert np.array_equal(best, agent.predict(rows, deterministic=True)[0])

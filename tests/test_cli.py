@@ -139,6 +139,8 @@ def test_every_argument_is_explained(name, inside, monkeypatch):
                 "env",
                 "policy",
                 "agent_zip",
+                "student",
+                "policies",
                 "run",
                 "file",
             ), argument

@@ -110,3 +110,12 @@ def test_the_command(tmp_path, inside, monkeypatch):
     wrong = inside("render", TOY, str(expert), cwd=tmp_path)
     assert wrong.returncode == 2
     assert "NAME=FILE" in wrong.stderr
+
+
+def test_one_environment_for_two_is_refused(tmp_path):
+    one = Drawn()
+    with pytest.raises(SettingError, match="one and the same"):
+        fdtasil.render({"a": rest, "b": push}, lambda: one, tmp_path / "f.gif", horizon=3)
+    many = lambda: gymnasium.vector.SyncVectorEnv([Drawn])  # noqa: E731
+    with pytest.raises(SettingError, match="vector"):
+        fdtasil.render({"a": rest}, many, tmp_path / "f.gif", horizon=3)

@@ -61,3 +61,12 @@ def test_what_is_no_actor_is_refused():
     )
     with pytest.raises(ExportError, match="choices"):
         chosen.to_sb3(InForm("box", "choice"), "SAC")
+
+
+def test_another_environment_is_refused():
+    result = fdtasil.distill(law, TOY, 0, **QUICK)
+    with pytest.raises(ExportError, match="from"):
+        result.to_sb3("Pendulum-v1", "SAC")
+    some = fdtasil.distill(law, TOY, 0, student_obs=[0, 1], **QUICK)
+    with pytest.raises(ExportError, match="whole observation"):
+        some.to_sb3(InForm(), "SAC")

@@ -103,3 +103,20 @@ def test_micro():
     assert result.student.architecture == fdtasil.Mlp((64, 64), "relu")
     with pytest.raises(SettingError, match="micro"):
         fdtasil.distill(law, TOY, 2, **{**QUICK, "student": "macro"})
+
+
+def test_another_call_in_the_same_folder_is_refused(run, tmp_path):
+    options = {**FAST, "fit": fdtasil.Fit(steps=5), "cloned": False, "keep": 0.0}
+    fdtasil.shrink(run, law, TOY, **options, out=tmp_path / "s")
+    with pytest.raises(SettingError, match="seed 0"):
+        fdtasil.shrink(run, law, TOY, **options, seed=1, out=tmp_path / "s")
+
+
+def test_students_see_what_the_runs_student_saw():
+    some = fdtasil.distill(law, TOY, 2, student_obs=[0, 2, 3], **QUICK)
+    options = {**FAST, "sizes": [(3,)], "fit": fdtasil.Fit(steps=5), "keep": 0.0}
+    found = fdtasil.shrink(some, law, TOY, **options)
+    assert found.result.student.observation_size == 3
+    past = fdtasil.distill(law, TOY, 2, history=2, **QUICK)
+    with pytest.raises(SettingError, match="a history"):
+        fdtasil.shrink(past, law, TOY, **options)

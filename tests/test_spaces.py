@@ -13,7 +13,7 @@ from sb3_agents import fresh_agent
 from toy_forms import ACTIONS, OBSERVATIONS, InForm, in_form
 
 import fdtasil
-from fdtasil.errors import EnvironmentFault, ExpertError, SettingError
+from fdtasil.errors import EnvironmentFault, ExpertError, ExportError, SettingError
 from fdtasil.results.distilled import Distilled
 from fdtasil.rollouts.spaces import Layout, Spaces, layout_of
 
@@ -361,3 +361,91 @@ def test_inputs_that_no_key_has_are_asked_for(tmp_path):
     path = keyed_onnx(tmp_path / "keys.onnx", {"place": (2,), "pace": (2,), "peace": (1,)})
     with pytest.raises(fdtasil.FdtasilError, match="'pace' and 'peace'"):
         fdtasil.distill(path, lambda: InForm("dictionary"), 3, **QUICK)
+
+
+@pytest.mark.parametrize("third", ["choice_0", "actions"])
+def test_names_that_a_graph_has_itself(third, tmp_path):
+    """A part may be called as an input, an output or a node of the file is."""
+
+    class Named(InForm):
+        def __init__(self):
+            super().__init__()
+            names = ("obs", third, "constant_0", "scores", "value_1")
+            self.names = names
+            self.observation_space = Dict({name: Box(-9, 9, (1,)) for name in names})
+
+        def reset(self, **given):
+            row, info = super().reset(**given)
+            return {name: row[i : i + 1] for i, name in enumerate(self.names)}, info
+
+        def step(self, action):
+            row, *rest = super().step(action)
+            return {name: row[i : i + 1] for i, name in enumerate(self.names)}, *rest
+
+    def expert(parts):
+        return law(np.concatenate([parts[name] for name in Named().names], axis=1))
+
+    result = fdtasil.distill(expert, Named, 2, **QUICK)
+    if third == "actions":  # which is the output's
+        with pytest.raises(ExportError, match="'actions'"):
+            result.export(tmp_path / "s.onnx", inputs="keys")
+        return
+    path = result.export(tmp_path / "s.onnx", inputs="keys")
+    rows = result.demonstrations.observations[:3]
+    session = onnxruntime.InferenceSession(path)
+    layout = layout_of(Named().observation_space, "observations")
+    feed = {name: rows[:, list(layout.columns(name))] for name in layout.names}
+    assert session.run(None, feed)[0] == pytest.approx(result.student.act(rows), abs=1e-5)
+
+
+def test_an_answer_in_a_row_is_taken_for_any_shape():
+    module = torch.nn.Linear(5, 2, device="meta").to_empty(device="cpu")
+    module.load_state_dict({"weight": torch.from_numpy(GAIN), "bias": torch.zeros(2)})
+    result = fdtasil.distill(module, lambda: InForm("box", "column"), 2, force=True, **QUICK)
+    judged = fdtasil.evaluate(
+        result.student, module, lambda: InForm("box", "column"), episodes=2, horizon=20, force=True
+    )
+    assert judged.student_returns == pytest.approx(result.evaluation.student_returns)
+
+
+def test_what_nests_in_no_space():
+    part = layout_of(Box(-1, 1, (2,)), "observations").to_json()[0]
+    for paths in ([["a"], []], [["a"], [0]], [[1]], [["a", "b"], ["a"]], [["a"], ["a"]]):
+        with pytest.raises(ValueError, match="no parts"):
+            Layout.from_json([{**part, "path": path} for path in paths])
+    with pytest.raises(ValueError, match="no parts"):
+        Layout.from_json([{**part, "shape": [2**32, 2**32]}])
+    assert Layout.from_json([{**part, "path": [0]}, {**part, "path": [1]}]).size == 4
+    with pytest.raises(EnvironmentFault, match="key 0"):
+        fdtasil.distill(law, lambda: _numbered(), 0, **QUICK)
+
+
+def _numbered():
+    environment = InForm()
+    environment.observation_space = Dict({0: Box(-1, 1, (2,)), 1: Box(-1, 1, (3,))})
+    return environment
+
+
+def test_one_key_and_flat_rows_and_none():
+    layout = layout_of(Dict(obs=Box(-1, 1, (3,))), "observations")
+    for given in (np.zeros(3), {"obs": np.zeros(3)}):
+        assert layout.read(given)[1]
+    assert not layout.read(np.zeros((2, 3)))[1]
+    frames = layout_of(Box(-1, 1, (2, 3)), "observations")
+    assert frames.rows(np.zeros((0, 2, 3))).shape == (0, 6)
+
+
+def test_what_was_made_and_is_refused_is_closed():
+    closed = []
+
+    class Odd(InForm):
+        def __init__(self):
+            super().__init__()
+            self.observation_space = Text(3)
+
+        def close(self):
+            closed.append(self)
+
+    with pytest.raises(EnvironmentFault):
+        fdtasil.distill(law, Odd, 0, **QUICK)
+    assert len(closed) == 1

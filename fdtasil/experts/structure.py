@@ -43,6 +43,9 @@ def in_spaces(expert: Expert, spaces: Spaces | None) -> Expert:
             "wrap the environment in FlattenObservation, or leave workers= out",
         )
     module = expert.module
+    if module is not None and not _answers_in_numbers(module, spaces, structured=structured):
+        ask = partial(ask_module, module.eval()) if expert.own_form else expert.answer
+        expert, module = replace(expert, answer=ask, module=None), None
     if module is not None:
         module = _Shaped(module, spaces.observations if structured else None, spaces.actions)
     if structured and module is not None:
@@ -54,6 +57,21 @@ def in_spaces(expert: Expert, spaces: Spaces | None) -> Expert:
         answer = _InSpaces(expert.answer, expert.name, seen, spaces.actions)
     jacobian = None if structured or spaces.actions.choices else expert.jacobian
     return replace(expert, answer=answer, module=module, jacobian=jacobian, spaces=spaces)
+
+
+def _answers_in_numbers(module: nn.Module, spaces: Spaces, *, structured: bool) -> bool:
+    """Whether a module returns (B, m) floats: scores, not choices, and no dictionary of them."""
+    rows = torch.zeros((2, spaces.observations.size))
+    like = next(module.parameters(), rows)
+    rows = rows.to(like.device, like.dtype)
+    try:
+        with torch.no_grad():
+            found = module(_tensors(spaces.observations, rows) if structured else rows)
+    except Exception:  # of the user's; the gate will show it
+        return True
+    if not isinstance(found, Tensor):
+        return False
+    return found.is_floating_point() and found.flatten(1).shape == (2, spaces.actions.size)
 
 
 def _with_scores(expert: Expert, spaces: Spaces, module: nn.Module | None) -> Expert:

@@ -1,5 +1,6 @@
 """How well a student's derivatives are its expert's, beside what the expert's own noise allows."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -45,6 +46,7 @@ def fidelity_of(
     states: np.ndarray,
     scales: Scales,
     random: np.random.Generator,
+    held: Sequence[int] = (),
 ) -> Fidelity:
     """Compare differences of a student and its expert (TaSIL, appendix on finite differences).
 
@@ -54,8 +56,9 @@ def fidelity_of(
         states: (S, n) of the expert's own episodes.
         scales: Of its states.
         random: Draws directions that nothing was trained on.
+        held: Coordinates that nothing moves: choices, flags, whole numbers.
     """
-    live = scales.probed("whitened")
+    live = scales.probed("whitened") & ~np.isin(np.arange(states.shape[1]), list(held))
     count, n = states.shape
     normal = random.standard_normal((count, _DIRECTIONS, n)) * live
     unit = normal / np.linalg.norm(normal, axis=2, keepdims=True) * live.sum() ** 0.5

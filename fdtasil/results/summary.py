@@ -1,13 +1,17 @@
 """What a run comes to, as rows of a table: the model card and the page are made of them."""
 
 from collections.abc import Mapping
+from dataclasses import fields
 from typing import Any
 
 from fdtasil.errors import shown
 from fdtasil.experts.expert import rows_text
 from fdtasil.results.size import size_text
+from fdtasil.student.fit import Fit
 
 __all__ = ["call_of", "run_rows"]
+
+_FIT = {field.name for field in fields(Fit)}
 
 Rows = list[tuple[str, str]]
 
@@ -37,19 +41,32 @@ def run_rows(report: Mapping[str, Any]) -> Rows:
 
 
 def call_of(settings: Mapping[str, Any]) -> str:
-    """Return the call that repeats a run, where expert and environment are files and ids."""
+    """Return the call of a run, as far as its settings say it.
+
+    What an expert, an environment or a dataset is made with, and functions, stand in no file.
+    """
     given = [repr(settings["expert"]), repr(settings["env"])]
     probes = settings["probes"]
     given.append("0" if probes == "none" else repr(probes))
     plain = {name: settings.get(name) for name in ("trainer", "episodes", "horizon", "seed")}
     given += [f"{name}={value!r}" for name, value in plain.items() if value is not None]
+    seen = settings.get("student_obs")
+    if seen is not None:
+        given.append(f"student_obs={seen!r}" if not isinstance(seen, str) else f"...  # {seen}")
+    if settings.get("keep") not in (None, "all"):
+        given.append(f"keep={settings['keep']!r}")
+    if settings.get("spread"):
+        given.append(f"spread={settings['spread']!r}")
+    if settings.get("past"):
+        given.append("history=...")
+    given.append(f"evaluation_episodes={settings['evaluation_episodes']}")
     student = dict(settings["student"])
     if "architecture" not in student:
         hidden = tuple(student.get("hidden", ()))
         given.append(f"student=fdtasil.Mlp({hidden}, {student.get('activation')!r})")
     fit = settings["fit"]
-    steps = {name: fit.get(name) for name in ("steps", "epochs", "learning_rate")}
-    told = ", ".join(f"{name}={value}" for name, value in steps.items() if value is not None)
+    names = [name for name in fit if name in _FIT and fit[name] is not None]
+    told = ", ".join(f"{name}={fit[name]}" for name in names)
     given.append(f"fit=fdtasil.Fit({told})")
     inside = ",\n".join(f"    {one}" for one in given)
     return f"import fdtasil\n\nresult = fdtasil.distill(\n{inside},\n)\n"

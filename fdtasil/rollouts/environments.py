@@ -132,8 +132,18 @@ class EnvironmentPool:
         self._kept: list[gymnasium.Env] = []  # only to be closed
         self.independent = False
         self.trials: dict[int, Any] = {}
+        self.together: Together | None = None
         first = self._new()
-        self.together: Together | None = vector_of(first)
+        try:
+            self._open(first)
+        except BaseException:
+            self._members, self.together = [], None
+            self._close(first)
+            raise
+
+    def _open(self, first: Any) -> None:
+        """Read what the first one is."""
+        self.together = vector_of(first)
         if self.together is None:
             env = self._checked(first)
             self.name = env.spec.id if env.spec else type(env.unwrapped).__name__
@@ -180,12 +190,17 @@ class EnvironmentPool:
     def close(self) -> None:
         """Close the copies that the pool made; what can't be closed is warned of."""
         together = [] if self.together is None else [self.together]
-        for member in [*self._members, *self._kept, *together] if self._owned else []:
-            try:
-                member.close()
-            except Exception as error:  # of the user's; what was done in it is not lost for that
-                kind = type(error).__name__
-                warn(f"{self.name} can't be closed: {kind}: {first_line(error)}")
+        for member in [*self._members, *self._kept, *together]:
+            self._close(member)
+
+    def _close(self, member: Any) -> None:
+        if not self._owned or not hasattr(member, "close"):
+            return
+        try:
+            member.close()
+        except Exception as error:  # of the user's; what was done in it is not lost for that
+            kind, name = type(error).__name__, getattr(self, "name", "the environment")
+            warn(f"{name} can't be closed: {kind}: {first_line(error)}")
 
     def __enter__(self) -> "EnvironmentPool":
         return self

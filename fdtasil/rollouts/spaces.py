@@ -4,6 +4,7 @@ Inside the library everything is (B, n) and (B, m); this is the one border to di
 stacks of frames and choices.
 """
 
+import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -64,7 +65,7 @@ class Part:
     @property
     def size(self) -> int:
         """How many numbers of the flat form it has."""
-        return sum(self.sizes) if self.kind == "choice" else int(np.prod(self.shape, dtype=int))
+        return sum(self.sizes) if self.kind == "choice" else math.prod(self.shape)
 
     def rows(self, values: Any) -> np.ndarray:
         """Return (B, size) float64 of B values; a choice may be given by its scores.
@@ -73,11 +74,12 @@ class Part:
             Mismatch: If they have another shape, or are no numbers.
         """
         given = _numbers(values, self.name)
-        flat = given.reshape(len(given), -1) if given.ndim else given
+        flat = given.reshape(len(given), math.prod(given.shape[1:]))
         if self.kind == "choice" and flat.shape == (len(given), len(self.sizes)):
             return self._one_hot(flat)
-        scores = self.kind == "choice" and flat.shape == (len(given), self.size)
-        if not scores and given.shape[1:] != self.shape:
+        # Scores, or numbers that somebody has laid in a row.
+        in_a_row = given.shape == flat.shape == (len(given), self.size)
+        if not in_a_row and given.shape[1:] != self.shape:
             what = f"{self.name!r} of " if self.path else ""
             raise Mismatch(f"{what}the shape {given.shape[1:]}, where {self.shape} is promised")
         return flat.astype(np.float64, copy=False)
@@ -197,14 +199,13 @@ class Layout:
             Mismatch: If it is neither.
         """
         first = self.parts[0]
-        flat = (
-            isinstance(given, np.ndarray) and given.ndim in (1, 2) and first.shape != given.shape
-        )
+        rows = isinstance(given, np.ndarray) and given.ndim in (1, 2)
+        flat = rows and (first.path or first.shape != given.shape)
         if flat and given.shape[-1] == self.size and given.dtype.kind == "f":
             return np.atleast_2d(given).astype(np.float32), given.ndim == 1
         one = np.ndim(_as_array(_picked(given, first))) == len(first.shape)
-        rows = self.row(given)[None] if one else self.rows(given)
-        return rows.astype(np.float32), one
+        found = self.row(given)[None] if one else self.rows(given)
+        return found.astype(np.float32), one
 
     def row(self, value: Any) -> np.ndarray:
         """Return (n,) float64 of one value.
@@ -283,14 +284,15 @@ class Layout:
             sizes, first = tuple(map(int, entry["sizes"])), tuple(map(int, entry["first"]))
             shape, dtype = tuple(map(int, entry["shape"])), np.dtype(str(entry["dtype"]))
             path = tuple(k if isinstance(k, int) else str(k) for k in entry["path"])
-            count = int(np.prod(shape, dtype=int)) if entry["kind"] == "choice" else 0
+            count = math.prod(shape) if entry["kind"] == "choice" else 0
             good = entry["kind"] in get_args(Kind) and len(sizes) == len(first) == count
             if not good or min((1, *shape, *sizes)) < 1 or dtype.kind not in "biuf":
                 raise ValueError(f"a part {path} that no space has")
             parts.append(Part(path, entry["kind"], shape, dtype.name, sizes, first))
-        if not parts or len({part.path for part in parts}) < len(parts):
-            raise ValueError("no parts, or two of one name")
-        return cls(tuple(parts))
+        found = cls(tuple(parts))
+        if not parts or not _is_nested([part.path for part in parts]) or found.size > _LARGEST:
+            raise ValueError("no parts, parts inside others, or larger than any space")
+        return found
 
 
 @dataclass(frozen=True)
@@ -324,6 +326,22 @@ class Spaces:
         return cls(*(Layout.from_json(fields[name]) for name in ("observations", "actions")))
 
 
+_LARGEST = 2**24  # numbers: a space of more is none that was written by us
+
+
+def _is_nested(paths: Sequence[tuple[str | int, ...]]) -> bool:
+    """Whether paths are the ends of nested dictionaries and tuples, each of one kind of key."""
+    if paths == [()]:
+        return True
+    if () in paths or len({type(path[0]) for path in paths}) != 1:
+        return False
+    inner: dict[str | int, list[tuple[str | int, ...]]] = {}
+    for path in paths:
+        inner.setdefault(path[0], []).append(path[1:])
+    whole = not isinstance(paths[0][0], int) or list(inner) == list(range(len(inner)))
+    return whole and all(map(_is_nested, inner.values()))
+
+
 def flat_layout(size: int) -> Layout:
     """Return the layout of plain numbers."""
     return Layout((Part((), "number", (size,), "float32"),))
@@ -346,10 +364,9 @@ def _parts(space: Any, path: tuple[str | int, ...], role: str) -> Iterator[Part]
     spaces, where = gymnasium.spaces, "/".join(map(str, path))
     if isinstance(space, spaces.Dict | spaces.Tuple) and len(space.spaces):
         inner = space.spaces.items() if isinstance(space, spaces.Dict) else enumerate(space.spaces)
+        numbered = isinstance(space, spaces.Tuple)
         for key, one in inner:
-            if not isinstance(key, str | int) or (
-                isinstance(key, str) and (not key or "/" in key)
-            ):
+            if not numbered and not (isinstance(key, str) and key and "/" not in key):
                 raise UnknownSpace(where, f"a dictionary with the key {key!r}", role)
             yield from _parts(one, (*path, key), role)
         return

@@ -148,7 +148,8 @@ def diagnose(
         with np.errstate(invalid="ignore"):  # of infinite bounds, which are not chosen
             units = np.where(boxes.bounded, (boxes.high - boxes.low) / 2, 1.0)
         random = generator(seed, "held-out directions")
-        fidelity = fidelity_of(act, asked, own.spread(_STATES), scales, random)
+        held = pool.spaces.observations.held
+        fidelity = fidelity_of(act, asked, own.spread(_STATES), scales, random, held)
         noise = [generator(seed, "disturbances", number) for number in range(count)]
         short = min(check_count("steps", steps), length)
         first = rollout(follow(asked.policy("evaluate")), pool, starts, short)

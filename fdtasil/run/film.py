@@ -3,7 +3,7 @@
 import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from io import BytesIO
 from pathlib import Path
@@ -79,6 +79,12 @@ def render(
     bars = Progress(progress)
     with ExitStack() as open_, bars.bar("film", "picture", 1) as bar:
         players = [open_.enter_context(_Player(*pair, env, seed)) for pair in policies.items()]
+        if len({id(player.simulator) for player in players}) < len(players):
+            raise SettingError(
+                "a function that returns one and the same environment",
+                "a new one for each policy",
+                "make it inside the function: lambda: gymnasium.make(...)",
+            )
         steps = resolve_horizon(horizon, players[0].pool)
         bar.lengthen(len(range(0, steps, every)))
         pictures = _pictures(players, steps, every, height, bar.move)
@@ -103,6 +109,12 @@ class _Player:
         self.name, self.seed, self.total, self.step, self.over = str(name), seed, 0.0, 0, False
         self.pool = EnvironmentPool(_drawing(env))
         try:
+            if self.pool.together is not None:
+                raise SettingError(
+                    f"{self.pool.name}, a vector environment",
+                    "one environment for each policy",
+                    "pass its id, or a function that makes one",
+                )
             self._act = _acting(policy, self.pool)
             (self._env,) = self.pool.take(1)
             _follow(self._env)
@@ -120,6 +132,11 @@ class _Player:
 
     def __exit__(self, *_: object) -> None:
         self.pool.close()
+
+    @property
+    def simulator(self) -> gymnasium.Env:
+        """What is stepped, without its wrappers."""
+        return self._env.unwrapped
 
     def move(self) -> None:
         """Take a step; an episode that is over stands still."""
@@ -259,14 +276,14 @@ def _mp4(pictures: Iterator[np.ndarray], fps: float) -> bytes:
             macro_block_size=2,
             quality=7,
         )
-        writer.send(None)
-        last = first
-        writer.send(np.ascontiguousarray(first))
-        for last in pictures:
-            writer.send(np.ascontiguousarray(last))
-        for _ in range(round(_LAST * fps)):
-            writer.send(np.ascontiguousarray(last))
-        writer.close()
+        with closing(writer):
+            writer.send(None)
+            last = first
+            writer.send(np.ascontiguousarray(first))
+            for last in pictures:
+                writer.send(np.ascontiguousarray(last))
+            for _ in range(round(_LAST * fps)):
+                writer.send(np.ascontiguousarray(last))
         return file.read_bytes()
 
 

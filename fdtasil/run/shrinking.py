@@ -9,6 +9,7 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from fdtasil.checks import check_count, check_flag, check_path, check_share
@@ -192,6 +193,7 @@ def shrink(
     folder = None if out is None else check_path("out", out).absolute()
     settings: dict[str, Any] = {
         "dataset": result.dataset,
+        "student_obs": _seen(result),
         "evaluation_episodes": check_count("evaluation_episodes", evaluation_episodes, 2),
         "horizon": result.settings["horizon"] if horizon is None else horizon,
         "seed": result.settings["seed"] if seed is None else seed,
@@ -211,6 +213,26 @@ def shrink(
         count = sum(not job.cloned for job in jobs)
         warn(f"no student of {count} keeps {share:.0%} of the expert's return")
     return shrunk
+
+
+def _seen(result: Distilled) -> tuple[int, ...] | None:
+    """Return what the students of a run see.
+
+    Raises:
+        SettingError: If no dataset says it: a function, a history, an expert's memory.
+    """
+    settings = result.settings
+    if settings.get("past") or settings.get("remembered"):
+        found = "a history" if settings.get("past") else "an expert with a memory"
+    elif isinstance(settings["student_obs"], str):
+        found = f"a student that sees through {settings['student_obs']}"
+    else:
+        return result.view.columns
+    raise SettingError(
+        f"a run with {found}",
+        "one whose student sees the observation, or some of its coordinates",
+        "distil each size anew: distill(..., student=fdtasil.Mlp((64, 64)))",
+    )
 
 
 @dataclass(frozen=True)
@@ -262,7 +284,7 @@ def _trained(
 ) -> Distilled:
     place = None if folder is None else folder / job.folder
     if place is not None and (place / "manifest.json").exists():
-        return Distilled.load(place)
+        return _checked(Distilled.load(place), settings, place)
     given = dict(settings)
     if job.cloned:
         given["dataset"] = replace(settings["dataset"], probes=None, answers=None)
@@ -273,6 +295,27 @@ def _trained(
         student=Mlp(job.hidden, job.activation),
         out=place,
         **given,
+    )
+
+
+def _checked(done: Distilled, settings: dict[str, Any], place: Path) -> Distilled:
+    """Return what is finished in a folder, if it is what would be made now."""
+    ours = {name: settings[name] for name in ("evaluation_episodes", "horizon", "seed")}
+    theirs = {name: done.settings.get(name) for name in ours}
+    ours["states"], theirs["states"] = (
+        len(settings["dataset"].demonstrations),
+        done.report["states"],
+    )
+    same = np.array_equal(
+        settings["dataset"].demonstrations.observations, done.demonstrations.observations
+    )
+    if ours == theirs and same and done.evaluation is not None:
+        return done
+    apart = [f"{name} {theirs[name]}" for name in ours if ours[name] != theirs[name]]
+    raise SettingError(
+        f"{place} holds a student of another call ({', '.join(apart) or 'other demonstrations'})",
+        "a folder of the same call, which was interrupted",
+        "write another out=, or remove that folder",
     )
 
 

@@ -12,7 +12,7 @@ from fdtasil.files.onnx.export import check_finite, export_module
 from fdtasil.student import plain
 from fdtasil.student.c_source import c_header, c_source, check_parity
 from fdtasil.student.int8 import as_int8
-from fdtasil.student.own_form import own_form
+from fdtasil.student.own_form import check_own_form, own_form
 from fdtasil.student.plain import PlainPolicy
 from fdtasil.student.policy import Student
 
@@ -31,6 +31,7 @@ def _onnx(
     import onnx
 
     model = own_form(onnx.load_from_string(written), student.spaces, keys=keys)
+    check_own_form(model, student, states, keys=keys)
     return model.SerializeToString(deterministic=True)
 
 

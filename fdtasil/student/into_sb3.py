@@ -3,6 +3,7 @@
 from collections.abc import Callable, Sequence
 from typing import Any
 
+import numpy as np
 import torch
 from torch import nn
 
@@ -79,13 +80,39 @@ def agent_of(student: Student, env: Any, algorithm: str, seed: int) -> Any:
             seed=check_count("seed", seed, 0, 2**32 - 1),
             device="cpu",
         )
+    _check_spaces(student, agent, choices)
+    pairs = list(zip(layers_of(agent.policy), layers, strict=True))
+    if any(mine.weight.shape != weight.shape for mine, (weight, _) in pairs):
+        raise ExportError(
+            f"a student of {student.observation_size} observations and {student.action_size} "
+            "actions as an actor of this environment",
+            f"layers of shapes {', '.join(str(tuple(mine.weight.shape)) for mine, _ in pairs)}",
+            "pass the environment that it was trained in; it must see the whole observation",
+        )
     with torch.no_grad():
-        for mine, (weight, bias) in zip(layers_of(agent.policy), layers, strict=True):
+        for mine, (weight, bias) in pairs:
             mine.weight.copy_(weight)
             mine.bias.copy_(bias)
         if algorithm == "TD3":
             agent.policy.actor_target.load_state_dict(agent.policy.actor.state_dict())
     return agent
+
+
+def _check_spaces(student: Student, agent: Any, choices: bool) -> None:
+    """Refuse an environment whose actions mean something else."""
+    if choices:
+        return
+    low, high = (
+        np.asarray(end, np.float32) for end in (agent.action_space.low, agent.action_space.high)
+    )
+    ours = student.low.numpy(), student.high.numpy()
+    if low.shape == ours[0].shape and np.allclose((low, high), ours, rtol=1e-5):
+        return
+    raise ExportError(
+        f"a student of actions from {ours[0]} to {ours[1]}",
+        f"{low} to {high}, as the environment",
+        "pass the environment that it was trained in",
+    )
 
 
 def _folded(student: Student) -> Layers | None:

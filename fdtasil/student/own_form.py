@@ -5,14 +5,16 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fdtasil.errors import ExportError
+from fdtasil.files.onnx.session import open_session
 from fdtasil.rollouts.spaces import Layout, Part, Spaces
+from fdtasil.student.policy import Student
 
 if TYPE_CHECKING:
     import onnx
 
-__all__ = ["own_form"]
+__all__ = ["check_own_form", "own_form"]
 
-_FLAT, _ANSWER = "obs", "actions"
+_FLAT, _ANSWER = "fdtasil.obs", "actions"
 
 
 def _with_choices(model: "onnx.ModelProto", actions: Layout) -> "onnx.ModelProto":
@@ -70,6 +72,13 @@ def _with_keys(model: "onnx.ModelProto", observations: Layout) -> "onnx.ModelPro
             "a student of a dictionary or a tuple of observations",
             'leave inputs= out: the file takes one input, "obs"',
         )
+    taken = {entry.name for entry in model.graph.output} & set(observations.names)
+    if taken:
+        raise ExportError(
+            f"a part of the observation called {taken.pop()!r}, as an output of the file is",
+            "another name",
+            'leave inputs= out: the file takes one input, "obs"',
+        )
     nodes, columns, inputs = _Nodes("key"), [], []
     for part in observations.parts:
         whole = part.kind in ("choice", "whole")
@@ -85,13 +94,78 @@ def _with_keys(model: "onnx.ModelProto", observations: Layout) -> "onnx.ModelPro
 
 def own_form(model: "onnx.ModelProto", spaces: Spaces | None, *, keys: bool) -> "onnx.ModelProto":
     """Return a student's model with what its environment's spaces ask for."""
+    _prefix(model)
     if spaces is not None and spaces.actions.choices:
         model = _with_choices(model, spaces.actions)
     if not keys:
+        model.graph.input[0].name = "obs"
+        for node in model.graph.node:
+            node.input[:] = ["obs" if name == _FLAT else name for name in node.input]
         return model
     if spaces is None:
         return _with_keys(model, Layout((Part((), "number", (1,), "float32"),)))
     return _with_keys(model, spaces.observations)
+
+
+def check_own_form(
+    model: "onnx.ModelProto", student: Student, states: np.ndarray, *, keys: bool
+) -> None:
+    """Compare a file in the environment's own form with its student.
+
+    Args:
+        model: From `own_form`.
+        student: The student.
+        states: (B, n) states of its training.
+        keys: Whether it takes each part by its name.
+
+    Raises:
+        ExportError: If it can't be run, or answers otherwise.
+    """
+    spaces = student.spaces
+    assert spaces is not None, "keys of observations without names were refused"
+    session, layout = open_session(model, "the export"), spaces.observations
+    feed = {"obs": states.astype(np.float32)}
+    if keys:
+        pairs = zip(session.get_inputs(), layout.parts, layout.starts, strict=True)
+        feed = {
+            entry.name: part.values(states[:, start : start + part.size]).astype(
+                np.int64 if entry.type == "tensor(int64)" else np.float32
+            )
+            for entry, part, start in pairs
+        }
+    scores, *chosen = (np.asarray(found) for found in session.run(None, feed))
+    expected = student.act(layout.rows(layout.values(states)).astype(np.float32))
+    near = np.abs(scores - expected).max() <= _NEAR * max(1.0, float(np.abs(expected).max()))
+    best = spaces.actions.values(scores) if chosen else None
+    if len(spaces.actions.parts) > 1:
+        best = None  # parts of several kinds, whose choices are given side by side
+    if near and (best is None or np.array_equal(chosen[0], best)):
+        return
+    raise ExportError(
+        "the ONNX file in the environment's own form answers otherwise than the student",
+        "the same answers",
+        'leave inputs= out, and tell us: the file takes one input, "obs"',
+    )
+
+
+_NEAR = 1e-4
+
+
+def _prefix(model: "onnx.ModelProto") -> None:
+    """Give what is inside names that no part of an observation has."""
+    ends = {_ANSWER}
+
+    def renamed(name: str) -> str:
+        return name if name in ends else f"fdtasil.{name}"
+
+    for node in model.graph.node:
+        node.input[:] = [renamed(name) for name in node.input]
+        node.output[:] = [renamed(name) for name in node.output]
+        node.name = renamed(node.name)
+    for tensor in model.graph.initializer:
+        tensor.name = renamed(tensor.name)
+    for entry in model.graph.input:
+        entry.name = renamed(entry.name)
 
 
 def _flat(nodes: "_Nodes", part: Part, whole: bool) -> str:
@@ -123,7 +197,7 @@ class _Nodes:
     def add(self, operator: str, *values: str, **attributes: Any) -> str:
         from onnx import helper
 
-        name = f"{self._prefix}_{len(self.nodes)}"
+        name = f"fdtasil.{self._prefix}_{len(self.nodes)}"
         self.nodes.append(helper.make_node(operator, values, [name], name, **attributes))
         return name
 
@@ -151,6 +225,6 @@ class _Nodes:
     def _constant(self, value: np.ndarray) -> str:
         from onnx import numpy_helper
 
-        name = f"{self._prefix}_constant_{len(self.constants)}"
+        name = f"fdtasil.{self._prefix}_constant_{len(self.constants)}"
         self.constants.append(numpy_helper.from_array(value, name))
         return name

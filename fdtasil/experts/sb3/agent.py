@@ -214,7 +214,13 @@ def _recurrent(
     archive: Archive, sizes: tuple[int, int], given: Bounds | None, before: nn.Module
 ) -> tuple[RecurrentNetwork, Bounds]:
     source, (n, m) = str(archive.path), sizes
-    activation, weights = read_activation(archive.record, RECURRENT, source), archive.weights()
+    try:
+        activation, weights = read_activation(archive.record, RECURRENT, source), archive.weights()
+    except ExpertError as refusal:
+        if refusal.next_step != TRUST:
+            raise
+        step = "load it with its own library, and pass the agent itself: distill(agent, env)"
+        raise ExpertError(refusal.found, refusal.expected, step) from refusal
     lstm = read_lstm(weights, n, source)
     after = build_network(weights, RECURRENT, activation, (lstm.hidden_size, m), source)
     if choice_sizes(archive.record):

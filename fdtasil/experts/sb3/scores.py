@@ -42,6 +42,17 @@ def _of_tensors(policy: Any) -> Callable[[Any], torch.Tensor] | None:
     def logits(rows: Any) -> torch.Tensor:
         parts = policy.get_distribution(rows).distribution
         parts = parts if isinstance(parts, list) else [parts]
-        return torch.cat([part.logits for part in parts], dim=1)
+        return torch.cat([_scores(part.logits, part) for part in parts], dim=1)
 
+    kind = getattr(policy, "action_dist", None)
+    return logits if type(kind).__name__ in _KNOWN else None
+
+
+_KNOWN = ("CategoricalDistribution", "MultiCategoricalDistribution", "BernoulliDistribution")
+
+
+def _scores(logits: torch.Tensor, part: Any) -> torch.Tensor:
+    """Return a score for each possibility; of yes and no, the logit is that of yes."""
+    if isinstance(part, torch.distributions.Bernoulli):
+        return torch.stack([torch.zeros_like(logits), logits], dim=2).flatten(1)
     return logits
