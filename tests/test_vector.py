@@ -67,18 +67,29 @@ def test_episodes_are_those_of_single_environments(kind):
         assert np.array_equal(ours, theirs), name
 
 
-@pytest.mark.parametrize("kind", ["sync, NextStep", "async, SameStep", "SubprocVecEnv"])
-def test_a_whole_run(kind):
-    kinds = {name.replace("-", "").lower(): made for name, made in KINDS.items()}
-    options = {**QUICK, "progress": False, "trainer": "dagger", "episodes": 4}
-    made = kinds[kind.replace("-", "").lower()]
-    many, single = (fdtasil.distill(law, env, 2, **options) for env in (made, walled))
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_whole_run(kind, tmp_path):
+    """Rollout, probes, training, evaluation, ONNX, resume."""
+    options = {**QUICK, "progress": False, "trainer": "dagger", "episodes": 3}
+
+    def stop(event):
+        if event.kind == "round":
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fdtasil.distill(law, KINDS[kind], 2, **options, out=tmp_path / "run", callback=stop)
+    many = fdtasil.distill(law, KINDS[kind], 2, **options, resume=tmp_path / "run")
+    single = fdtasil.distill(law, walled, 2, **options)
     assert many.demonstrations.observations == pytest.approx(
         single.demonstrations.observations, abs=1e-5
     )
     assert many.evaluation.student_returns == pytest.approx(
         single.evaluation.student_returns, abs=1e-3
     )
+    judged = fdtasil.evaluate(
+        str(tmp_path / "run" / "student.onnx"), law, KINDS[kind], episodes=2, horizon=20
+    )
+    assert judged.student_returns == pytest.approx(many.evaluation.student_returns, rel=1e-4)
 
 
 def test_other_forms_step_together_too():
