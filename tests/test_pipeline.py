@@ -71,6 +71,7 @@ def test_a_run_folder_holds_everything_and_reads_back(quick, tmp_path):
     folder = quick.save(tmp_path / "run")
     names = {str(path.relative_to(folder)) for path in folder.rglob("*") if path.is_file()}
     assert names == {
+        "README.md",
         "config.json",
         "report.json",
         "progress.csv",

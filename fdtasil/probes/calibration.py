@@ -200,7 +200,8 @@ def calibrate(
     regime, radius, stencil = _judge(similarity, radii[1:], usual)
     radius = min(radius, float(radii[-1]))  # where it still answers
     steep = np.interp(np.log(radius), np.log(radii), change) > _STEEP * centres.std(axis=0).mean()
-    switches = _switches(values, centres)
+    # Where some have no answer, few may be left, and farther away there are fewer still.
+    switches = not shares and _switches(values, centres)
     return Calibration(
         regime,
         floor,

@@ -80,7 +80,8 @@ def distil(arguments: Arguments, *, progress: bool = True) -> Distilled:
     network = {name: value for name, value in said.items() if value is not None}
     output, inputs, trust = (rest.pop(name) for name in ("output", "inputs", "trust"))
     formats = rest.pop("log_formats")
-    rest["env"] = wanted(rest["env"], *(rest.pop(name) for name in ENVIRONMENT_FLAGS))
+    made = (rest.pop(name, usual) for name, (_, usual, _) in ENVIRONMENT_FLAGS.items())
+    rest["env"] = wanted(rest["env"], *made)
     rest["expert"] = opened(rest["expert"], rest["env"], output=output, inputs=inputs, trust=trust)
     folder = Path(rest["out"] or rest["resume"] or ".")
     return distill(
