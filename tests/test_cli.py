@@ -79,6 +79,17 @@ def test_the_environment_is_made_and_reset_as_flags_say(called, inside, tmp_path
         assert "a JSON object" in done.stderr
 
 
+def test_what_a_student_sees_by_number_or_name(called, inside, tmp_path):
+    for words, expected in ((["0", "2"], (0, 2)), (["arm", "leg"], ("arm", "leg"))):
+        inside("distill", "e.onnx", TOY, "--student-obs", *words, cwd=tmp_path)
+        assert called["student_obs"] == expected
+
+
+def test_a_file_of_weights_is_no_policy(expert, inside, tmp_path):
+    done = inside("evaluate", tmp_path / "student.safetensors", TOY, "--expert", expert)
+    assert "student.onnx" in done.stderr
+
+
 def test_another_gravity_is_judged_otherwise(expert, inside):
     line = ["evaluate", expert, TOY, "--expert", expert, "--episodes", "2", "--horizon", "30"]
     made = inside(*line, "--env-kwargs", '{"wall": 1.01}')

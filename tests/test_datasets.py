@@ -13,7 +13,7 @@ from toy_forms import ACTIONS, OBSERVATIONS, in_form
 import fdtasil
 from fdtasil import Fit, Mlp
 from fdtasil.demonstrations.dataset import Dataset, load_dataset
-from fdtasil.errors import SettingError, StorageError
+from fdtasil.errors import ExpertError, FdtasilWarning, SettingError, StorageError
 from fdtasil.student.view import View
 
 
@@ -325,3 +325,17 @@ def test_a_minari_dataset_of_dictionaries_and_choices_with_its_expert(tmp_path, 
     assert result.queries["probe"] > 0
     seen = data.spaces.observations.value(data.demonstrations.observations[0])
     assert result.student.predict(seen)[0] in (1, 2, 3, 4)
+
+
+def test_an_expert_beside_a_dataset_passes_a_gate_too(arrays):
+    data = fdtasil.from_arrays(*arrays, low=-9, high=9)
+    options = {"dataset": data, "probes": 2, "fit": Fit(steps=5)}
+    random = np.random.default_rng(0)
+    noisy = lambda rows: rows @ GAIN.T + random.standard_normal((len(rows), 2))  # noqa: E731
+    with pytest.raises(ExpertError, match="asked twice differs"):
+        fdtasil.distill(noisy, **options)
+    with pytest.warns(FdtasilWarning, match="otherwise than the demonstrations at 16 of 16"):
+        fdtasil.distill(lambda rows: -rows @ GAIN.T, **options)
+    result = fdtasil.distill(lambda rows: rows @ GAIN.T, **options)
+    assert result.queries == result.report["predicted_queries"]
+    assert repr(data).startswith("Dataset(arrays: 40 states of 1 episodes")

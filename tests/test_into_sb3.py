@@ -67,6 +67,9 @@ def test_another_environment_is_refused():
     result = fdtasil.distill(law, TOY, 0, **QUICK)
     with pytest.raises(ExportError, match="from"):
         result.to_sb3("Pendulum-v1", "SAC")
+    for other in ("Nope-v1", "CartPole-v1"):
+        with pytest.raises(ExportError, match="makes no SAC"):
+            result.to_sb3(other, "SAC")
     some = fdtasil.distill(law, TOY, 0, student_obs=[0, 1], **QUICK)
     with pytest.raises(ExportError, match="whole observation"):
         some.to_sb3(InForm(), "SAC")

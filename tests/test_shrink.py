@@ -95,7 +95,7 @@ def test_the_command(tmp_path, inside):
     done = inside(*line, "--evaluation-episodes", "2", "--no-cloned", cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert "4x4 relu" in done.stdout
-    assert (tmp_path / "runs" / "shrunk" / "4x4-relu" / "student.onnx").exists()
+    assert (tmp_path / "run-shrunk" / "4x4-relu" / "student.onnx").exists()
 
 
 def test_micro():

@@ -449,3 +449,15 @@ def test_what_was_made_and_is_refused_is_closed():
     with pytest.raises(EnvironmentFault):
         fdtasil.distill(law, Odd, 0, **QUICK)
     assert len(closed) == 1
+
+
+def test_an_expert_that_is_called_wrongly_is_told_what_it_is_given():
+    with pytest.raises(ExpertError, match=r"place \(B, 2\), speed \(B, 2\)|rest \(B, 1\)"):
+        fdtasil.distill(lambda rows: rows[:, :2], lambda: InForm("dictionary"), 0, **QUICK)
+
+
+def test_a_result_is_judged_as_it_is():
+    result = distilled("dictionary", student_obs=["place", "speed"])
+    expert, env = in_form(law, "dictionary"), lambda: InForm("dictionary")
+    judged = fdtasil.evaluate(result, expert, env, episodes=2, horizon=20)
+    assert judged.student_returns == pytest.approx(result.evaluation.student_returns)

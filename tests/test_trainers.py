@@ -13,7 +13,7 @@ from fdtasil.demonstrations.trainers import (
     Situation,
     trainer_of,
 )
-from fdtasil.errors import SettingError
+from fdtasil.errors import FdtasilWarning, SettingError
 from fdtasil.experts.load import load_expert
 from fdtasil.rollouts.environments import EnvironmentPool
 from fdtasil.rollouts.rollout import rollout
@@ -183,3 +183,9 @@ def test_a_mixture_that_is_no_share_is_refused(beta):
 def test_wrong_settings_are_refused(wrong):
     with pytest.raises(SettingError):
         wrong()
+
+
+@pytest.mark.parametrize("trainer", ["dagger", "dart"])
+def test_one_episode_is_one_round(trainer, linear):
+    with pytest.warns(FdtasilWarning, match="leave trainer="):
+        fdtasil.distill(linear, TOY, 0, trainer=trainer, **{**QUICK, "episodes": 1})

@@ -26,7 +26,7 @@ __all__ = ["Dataset", "DatasetLike", "check_dataset", "check_shapes", "load_data
 _VERSION = 2
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Dataset:
     """Everything that a student can be trained from without one new query.
 
@@ -47,6 +47,15 @@ class Dataset:
     high: np.ndarray
     environment: str
     spaces: Spaces | None = None
+
+    def __repr__(self) -> str:
+        """Return a line, not the arrays."""
+        (n, m), states = self.sizes, self.demonstrations
+        return (
+            f"Dataset({self.environment}: {len(states):,} states of {states.episodes} episodes, "
+            f"{n} observations, {m} actions, probes "
+            f"{self.probes.describe() if self.probes else 'none'})"
+        )
 
     @property
     def sizes(self) -> tuple[int, int]:

@@ -259,7 +259,7 @@ class Expert:
         except ExpertError:
             raise
         except Exception as error:
-            raise _Raised.of(self.name, len(rows), expected, error) from error
+            raise _Raised.of(self.name, len(rows), expected, error, self._given) from error
         if answer.shape == (len(rows), 1) and self.action_size and np.isnan(answer).all():
             answer = np.repeat(answer, self.action_size, axis=1)  # nulls in the place of rows
         if answer.ndim != 2 or len(answer) != len(rows) or not self._has_action_size(answer):
@@ -272,6 +272,17 @@ class Expert:
         if infinite.any():
             raise _not_finite(self, len(rows), infinite)
         return answer
+
+    @property
+    def _given(self) -> str:
+        """What it is called with, for who called it wrongly."""
+        layout = self.spaces.observations if self.spaces and self.own_form else None
+        if layout is None or layout.plain:
+            return "experts answer (B, n) with (B, m)"
+        parts = [
+            f"{p.name or 'an array'} (B, {', '.join(map(str, p.shape))})" for p in layout.parts
+        ]
+        return f"it is given what the environment gives, in a batch: {', '.join(parts[:6])}"
 
     def _has_action_size(self, answer: np.ndarray) -> bool:
         return self.action_size is None or answer.shape[1] == self.action_size
@@ -291,14 +302,14 @@ class _Raised(Exception):
         self.error, self.text, self.everywhere = error, text, everywhere
 
     @classmethod
-    def of(cls, name: str, rows: int, expected: str, error: Exception) -> "_Raised":
+    def of(cls, name: str, rows: int, expected: str, error: Exception, given: str) -> "_Raised":
         """Return what an exception on so many rows is."""
         kind = error.kind if isinstance(error, RaisedElsewhere) else type(error).__name__
         said = in_one_line(error)
         whole = ExpertError(
             f"{name} raised {kind} on {rows} observations: {said}",
             expected,
-            "call it on such a batch on its own; experts answer (B, n) with (B, m)",
+            f"call it on such a batch on its own; {given}",
         )
         whole.__cause__ = error
         return cls(whole, f"{kind}: {said}", everywhere=kind in _NOT_OF_A_ROW)

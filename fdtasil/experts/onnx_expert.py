@@ -52,6 +52,12 @@ def open_onnx(source: str | Path, hints: Hints) -> Expert:
         ExpertError: If the file can't be opened, or its signature does not fit.
     """
     path = Path(source)
+    if path.suffix in (".safetensors", ".py", ".h"):
+        raise ExpertError(
+            f"{path}, which is no ONNX file",
+            "an .onnx file, an agent's .zip, or a .c file",
+            "of a student, take the student.onnx beside it",
+        )
     model, digest = read_model(path)
     columns = _columns(model, path)
     wanted = None if columns else hints.observation_size

@@ -74,12 +74,17 @@ def fidelity_of(
         difference = (said - theirs[:, None])[heard]
         error = (mine - ours[:, None])[heard] - difference
         size = float(np.sqrt(np.nanmean(difference**2)))
-        errors.append(float(np.sqrt(np.nanmean(error**2))) / size if size > 0 else float("inf"))
-        floors.append(2**0.5 * noise / size if size > 0 else float("inf"))
+        apart = float(np.sqrt(np.nanmean(error**2)))
+        errors.append(_share(apart, size))
+        floors.append(_share(2**0.5 * noise, size))
     spread = float(np.sqrt(np.nanmean((theirs - np.nanmean(theirs, axis=0)) ** 2)))
     apart = float(np.sqrt(np.nanmean((ours - theirs) ** 2)))
-    share = apart / spread if spread > 0 else float("inf")
-    return Fidelity(RADII, tuple(errors), tuple(floors), share)
+    return Fidelity(RADII, tuple(errors), tuple(floors), _share(apart, spread))
+
+
+def _share(part: float, whole: float) -> float:
+    """Return a part as a share; nothing of nothing is none."""
+    return part / whole if whole > 0 else 0.0 if part == 0 else float("inf")
 
 
 def _noise(expert: Expert, states: np.ndarray, steps: np.ndarray) -> float:

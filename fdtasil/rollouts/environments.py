@@ -127,6 +127,8 @@ class EnvironmentPool:
             if isinstance(given, str)
             else "call it on its own; an expert comes before the environment"
         )
+        if wanted.kwargs:
+            self._advice = f"check the names in kwargs ({', '.join(map(str, wanted.kwargs))})"
         self._make = wanted.factory()
         self._members: list[gymnasium.Env] = []
         self._kept: list[gymnasium.Env] = []  # only to be closed

@@ -6,11 +6,13 @@ from fdtasil.checks import check_choice, check_count, spelt
 from fdtasil.demonstrations.dataset import Dataset
 from fdtasil.demonstrations.trainers import (
     BehaviourCloning,
+    DAgger,
+    Dart,
     Trainer,
     check_choices,
     trainer_of,
 )
-from fdtasil.errors import SettingError
+from fdtasil.errors import SettingError, warn
 from fdtasil.experts.cost import CHEAP, multiply_adds
 from fdtasil.experts.expert import Expert
 from fdtasil.files.storage import sha256
@@ -88,6 +90,12 @@ class Arguments:
         """
         if subject.spaces and subject.spaces.actions.choices and self.trainer is not None:
             check_choices(self.trainer)
+        if self.trainer is not None and isinstance(self.trainer, DAgger | Dart):
+            if len(self.trainer.rounds(self.episodes)) == 1:
+                warn(
+                    f"{self.episodes} episode(s) leave trainer={self.trainer.name!r} one round, "
+                    "in which the expert acts as in cloning: raise episodes="
+                )
         usual = self._usual(subject)
         if self.anew is None or subject.expert is None:
             return usual

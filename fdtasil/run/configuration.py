@@ -121,6 +121,8 @@ class Configuration:
             again = GATE_STATES if self.evaluation_episodes or self.trainer is not None else 0
             found["check"] = gates * GATE_QUERIES + self._largest_batch(found) + again
             found["evaluate"] = 2 * self.evaluation_episodes * self.horizon
+        elif self.expert is not None:  # on the states of a dataset
+            found["check"] = GATE_QUERIES + GATE_STATES
         if self.remembered:  # each step of the environment
             found["remember"] = found["act"] + found["label"] + found["evaluate"] + _TRIED
         return found

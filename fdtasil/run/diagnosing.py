@@ -73,11 +73,9 @@ class Diagnosis:
                 f"  gamma(e) = {loop.constant:.2g} * e^{loop.exponent:.2f} [{low:.2f}, {high:.2f}]"
                 f"; order that theorem 3.2 asks for: {order}"
             )
-        bound = "none" if self.bound is None else f"{self.bound:.2g}"
-        lines.append(
-            f"largest error on the student's path {self.largest_error:.2g}: distance to the "
-            f"expert's path at most {bound} by that law, measured {self.gap:.2g} deviations"
-        )
+        law = "no law, no bound" if self.bound is None else f"at most {self.bound:.2g} by that law"
+        lines.append(f"the student's largest error on its own path: {self.largest_error:.2g}")
+        lines.append(f"its distance to the expert's path: {self.gap:.2g} deviations ({law})")
         return "\n".join(lines)
 
 
@@ -106,8 +104,8 @@ def diagnose(
         env: As in `distill`.
         episodes: From as many starts.
         horizon: Steps after which an episode is cut; default: the environment's time limit.
-        steps: Of these, how many are disturbed and followed. Legged robots are chaotic: after a
-            few dozen steps the smallest disturbance has led elsewhere.
+        steps: From the start of each episode, how many steps are disturbed and followed. Legged
+            robots are chaotic: after a few dozen the smallest disturbance has led elsewhere.
         seed: Of starts and directions.
         progress: Show progress bars, where there is a terminal.
 

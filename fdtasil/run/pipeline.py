@@ -33,6 +33,7 @@ from fdtasil.run.asking import Asking
 from fdtasil.run.checkpoints import Checkpoints
 from fdtasil.run.collecting import Collecting
 from fdtasil.run.configuration import Configuration
+from fdtasil.run.dataset_gate import examine_given
 from fdtasil.run.doubts import warn_of_misfit, warn_of_silence
 from fdtasil.run.events import Callback, Event, tell_all
 from fdtasil.run.folder import asked_anew, open_run_folder
@@ -222,7 +223,7 @@ def distill(
 
 
 def evaluate(
-    policy: ExpertLike,
+    policy: ExpertLike | Distilled,
     expert: ExpertLike,
     env: EnvironmentLike,
     *,
@@ -238,8 +239,8 @@ def evaluate(
     """Compare a policy with an expert from the same starts.
 
     Args:
-        policy: The policy to judge: a `Student`, an exported ONNX file, or anything else that an
-            expert may be.
+        policy: The policy to judge: a result, a `Student`, an exported ONNX file, or anything else
+            that an expert may be.
         expert: The policy to judge it by, as in `distill`.
         env: A gymnasium id (`module:Id` too), a gymnasium environment, or a function making one.
         episodes: Number of paired episodes.
@@ -268,6 +269,9 @@ def evaluate(
     check_count("seed", seed, 0, 2**32 - 1)
     force = check_flag("force", force)
     limits = None if constraints is None else check_constraints(constraints)
+    if isinstance(policy, Distilled):
+        student_obs = policy.view.columns if student_obs is None else student_obs
+        policy = policy.student
     history = check_history(history, student_obs)
     count, bars = check_count("episodes", episodes), Progress(check_flag("progress", progress))
     with EnvironmentPool(env) as pool, torch_settings(torch.device("cpu")):
@@ -340,7 +344,7 @@ def _complete(
     """Gate, rounds, evaluation, report."""
     run, checkpoints = rounds.run, rounds.training.checkpoints
     with torch_settings(device) as precision:
-        theirs = _examined(rounds, subject, force=force)
+        theirs = _examined(rounds, subject, given, force=force)
         checkpoints.account.start_clock()
         lesson, trained = rounds.complete(given, theirs)
         seconds, student, evaluation = checkpoints.account.seconds, trained.student, None
@@ -391,9 +395,13 @@ def _complete(
     )
 
 
-def _examined(rounds: Rounds, subject: Subject, *, force: bool) -> Episodes | None:
+def _examined(
+    rounds: Rounds, subject: Subject, given: Dataset | None, *, force: bool
+) -> Episodes | None:
     """Lead the expert through the gate; return its episodes where they are compared with."""
     run, expert, pool = rounds.run, subject.expert, subject.pool
+    if expert is not None and pool is None and given is not None:
+        examine_given(expert, given, force=force)
     if expert is None or pool is None:
         return None
     starts = episode_seeds(run.seed, "evaluation", 0, run.evaluation_episodes or GATE_STATES)

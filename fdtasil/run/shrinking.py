@@ -191,6 +191,12 @@ def shrink(
             "leave workers= out",
         )
     folder = None if out is None else check_path("out", out).absolute()
+    if horizon is None and not result.settings["horizon"]:
+        raise SettingError(
+            "a run without an environment, and so without a horizon",
+            "the steps after which an episode of the comparison is cut",
+            "write for example horizon=300",
+        )
     settings: dict[str, Any] = {
         "dataset": result.dataset,
         "student_obs": _seen(result),
@@ -200,7 +206,9 @@ def shrink(
         "fit": fit,
         "progress": False,
     }
-    train = partial(_trained, expert, env, settings, folder)
+    names = ("expert_sha256", "env") if result.settings["horizon"] else ()
+    about = {name: result.settings[name] for name in names}
+    train = partial(_trained, expert, env, settings, about, folder)
     found = dict[_Job, Distilled]()
     with Progress(check_flag("progress", progress)).bar("students", "student", len(jobs)) as bar:
         for job, student in _all(train, jobs, workers):
@@ -279,12 +287,13 @@ def _trained(
     expert: ExpertLike,
     env: EnvironmentLike,
     settings: dict[str, Any],
+    about: dict[str, Any],
     folder: Path | None,
     job: _Job,
 ) -> Distilled:
     place = None if folder is None else folder / job.folder
     if place is not None and (place / "manifest.json").exists():
-        return _checked(Distilled.load(place), settings, place)
+        return _checked(Distilled.load(place), settings, about, place)
     given = dict(settings)
     if job.cloned:
         given["dataset"] = replace(settings["dataset"], probes=None, answers=None)
@@ -298,10 +307,14 @@ def _trained(
     )
 
 
-def _checked(done: Distilled, settings: dict[str, Any], place: Path) -> Distilled:
+def _checked(
+    done: Distilled, settings: dict[str, Any], run: dict[str, Any], place: Path
+) -> Distilled:
     """Return what is finished in a folder, if it is what would be made now."""
     ours = {name: settings[name] for name in ("evaluation_episodes", "horizon", "seed")}
     theirs = {name: done.settings.get(name) for name in ours}
+    ours |= run
+    theirs |= {name: done.settings.get(name) for name in run}
     ours["states"], theirs["states"] = (
         len(settings["dataset"].demonstrations),
         done.report["states"],

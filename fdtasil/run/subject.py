@@ -115,7 +115,7 @@ def named(
             raise SettingError(
                 spelt("student_obs", student_obs),
                 f"names of parts of the observation: {', '.join(known) or 'it has none'}",
-                "write indices, or these names",
+                "write these names, or indices" if known else "write indices, such as 0 1 2",
             ) from None
     return tuple(dict.fromkeys(columns))
 

@@ -18,7 +18,15 @@ from fdtasil.shell.command import OptionalText
 from fdtasil.student.architectures import Mlp
 from fdtasil.student.fit import Fit
 
-__all__ = ["ENVIRONMENT_FLAGS", "KWARGS_TEXT", "OPTIONS_TEXT", "distil", "opened", "wanted"]
+__all__ = [
+    "ENVIRONMENT_FLAGS",
+    "KWARGS_TEXT",
+    "OPTIONS_TEXT",
+    "distil",
+    "opened",
+    "seen",
+    "wanted",
+]
 
 Arguments = Mapping[str, Any]
 
@@ -80,6 +88,7 @@ def distil(arguments: Arguments, *, progress: bool = True) -> Distilled:
     network = {name: value for name, value in said.items() if value is not None}
     output, inputs, trust = (rest.pop(name) for name in ("output", "inputs", "trust"))
     formats = rest.pop("log_formats")
+    rest["student_obs"] = seen(rest.get("student_obs"))
     made = (rest.pop(name, usual) for name, (_, usual, _) in ENVIRONMENT_FLAGS.items())
     rest["env"] = wanted(rest["env"], *made)
     rest["expert"] = opened(rest["expert"], rest["env"], output=output, inputs=inputs, trust=trust)
@@ -91,6 +100,14 @@ def distil(arguments: Arguments, *, progress: bool = True) -> Distilled:
         callback=Log(folder / "log", *formats) if formats else None,
         progress=progress,
     )
+
+
+def seen(tokens: tuple[str, ...] | None) -> tuple[int, ...] | tuple[str, ...] | None:
+    """Return what a student sees: indices, or names of parts."""
+    if tokens is None:
+        return None
+    numbers = [token for token in tokens if token.isascii() and token.isdigit()]
+    return tuple(map(int, numbers)) if len(numbers) == len(tokens) else tokens
 
 
 def opened(

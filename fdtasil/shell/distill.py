@@ -206,7 +206,7 @@ command = as_command(
                 "probes": str | None,
                 "trainer": str,
                 "dataset": str | None,
-                "student_obs": tuple[int, ...] | None,
+                "student_obs": tuple[str, ...] | None,
                 "spread": str | None,
                 "resume": Path | None,
             },

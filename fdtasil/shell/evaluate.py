@@ -4,7 +4,7 @@ from typing import Any
 
 from fdtasil.experts.load import load_expert
 from fdtasil.run.pipeline import evaluate
-from fdtasil.shell.call import ENVIRONMENT_FLAGS, opened, wanted
+from fdtasil.shell.call import ENVIRONMENT_FLAGS, opened, seen, wanted
 from fdtasil.shell.command import EnvironmentId, Flags, PolicyPath, as_command, import_module_of
 
 __all__ = ["command"]
@@ -24,6 +24,7 @@ def _evaluate(
     assert place is not None
     judge = opened(expert, place, output=output, inputs=inputs, trust=trust)
     assert judge is not None
+    arguments["student_obs"] = seen(arguments["student_obs"])
     compiled = policy.endswith(".c")  # the only policy that asks for trust of its own
     judged = load_expert(policy, trust=trust) if compiled else policy
     print(evaluate(judged, expert=judge, env=place, **arguments))
@@ -39,7 +40,7 @@ command = as_command(
                 "policy": PolicyPath,
                 "env": EnvironmentId,
                 "expert": str,
-                "student_obs": tuple[int, ...] | None,
+                "student_obs": tuple[str, ...] | None,
             },
         ),
         Flags(load_expert, only=("output", "inputs", "trust"), types={"inputs": str | None}),

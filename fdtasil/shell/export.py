@@ -23,3 +23,5 @@ def command(run: RunFolder, file: OutFile) -> None:
             answers with numpy alone, from the .safetensors).
     """
     print(f"written: {Distilled.load(run).export(file)}")
+    if file.suffix == ".py":
+        print(f"it opens the weights: fdtasil export {run} {file.with_suffix('.safetensors')}")

@@ -17,6 +17,6 @@ def command(run: RunFolder, /, *, out: Path | None = None) -> None:
         run: Folder of a finished run.
         out: Where; left out, RUN.html beside the folder.
     """
-    file = run.absolute().with_suffix(".html") if out is None else out.absolute()
+    file = run.parent / f"{run.name}.html" if out is None else out
     write_bytes(file, page_of(Distilled.load(run)).encode())
-    print(f"written: {file.name if out is None else out}")
+    print(f"written: {file}")

@@ -8,7 +8,7 @@ import torch
 from torch import nn
 
 from fdtasil.checks import check_choice, check_count
-from fdtasil.errors import ExportError
+from fdtasil.errors import ExportError, first_line
 from fdtasil.experts.sb3.randomness import randomness_kept
 from fdtasil.student.architectures import ACTIVATIONS, Mlp
 from fdtasil.student.policy import Student
@@ -62,6 +62,7 @@ def agent_of(student: Student, env: Any, algorithm: str, seed: int) -> Any:
     good = isinstance(network, Mlp) and flat and (choices if chooses else bounded)
     if not good or layers is None or not isinstance(network, Mlp):
         kind = "choices" if choices else "numbers with bounds" if bounded else "unbounded numbers"
+        kind += "" if flat else ", on a dictionary or a stack,"
         raise ExportError(
             f"a student of {kind} as an actor of {algorithm}",
             "an Mlp on flat observations, with bounded numbers for SAC and TD3, choices for PPO",
@@ -72,14 +73,17 @@ def agent_of(student: Student, env: Any, algorithm: str, seed: int) -> Any:
     widths = list(network.hidden) if isinstance(network.hidden, tuple) else [network.hidden]
     arch: Any = {"pi": widths, "vf": widths} if chooses else widths
     settings = {"net_arch": arch, "activation_fn": type(ACTIVATIONS[network.activation]())}
-    with randomness_kept():
-        agent = getattr(stable_baselines3, algorithm)(
-            "MlpPolicy",
-            env,
-            policy_kwargs=settings,
-            seed=check_count("seed", seed, 0, 2**32 - 1),
-            device="cpu",
-        )
+    seed = check_count("seed", seed, 0, 2**32 - 1)
+    make = getattr(stable_baselines3, algorithm)
+    try:
+        with randomness_kept():
+            agent = make("MlpPolicy", env, policy_kwargs=settings, seed=seed, device="cpu")
+    except Exception as error:  # of gymnasium, or of the library
+        raise ExportError(
+            f"stable-baselines3 makes no {algorithm} in this environment: {first_line(error)}",
+            "the environment that the student was trained in",
+            "pass its id, or the environment itself",
+        ) from error
     _check_spaces(student, agent, choices)
     pairs = list(zip(layers_of(agent.policy), layers, strict=True))
     if any(mine.weight.shape != weight.shape for mine, (weight, _) in pairs):

@@ -1,0 +1,44 @@
+"""The gate of an expert beside a dataset: on the states that are given, without an environment."""
+
+import numpy as np
+
+from fdtasil.demonstrations.dataset import Dataset
+from fdtasil.errors import warn
+from fdtasil.experts.expert import Expert
+from fdtasil.experts.gate import GATE_STATES, admit_expert
+from fdtasil.rollouts.behaviours import has_none
+from fdtasil.rollouts.environments import Boxes
+
+__all__ = ["examine_given"]
+
+_SAME = 1e-2  # of the actions' deviation; demonstrators' files round, and clip
+
+
+def examine_given(expert: Expert, given: Dataset, *, force: bool) -> None:
+    """Check an expert on states of a dataset, and whether its answers are those that stand there.
+
+    Args:
+        expert: Counts its rows under "check".
+        given: The dataset.
+        force: Only warn, where the expert answers at all.
+
+    Raises:
+        ExpertError: If it fails a check.
+    """
+    states = given.demonstrations
+    chosen = np.linspace(0, len(states) - 1, GATE_STATES).round().astype(int)
+    rows, said = states.observations[chosen], states.actions[chosen]
+    boxes = Boxes(rows.shape[1], given.low, given.high)
+    admit_expert(expert, rows, boxes, force=force)
+    answers = expert.ask(rows, "check")
+    heard = ~has_none(answers)
+    spread = float(states.actions.std(axis=0, dtype=np.float64).mean()) or 1.0
+    clipped = np.clip(answers[heard], given.low, given.high)
+    apart = np.abs(clipped - np.clip(said[heard], given.low, given.high)).max(axis=1, initial=0.0)
+    other = int((apart > _SAME * spread).sum())
+    if other:
+        warn(
+            f"{expert.name} answers otherwise than the demonstrations at {other} of "
+            f"{len(chosen)} states, by up to {apart.max():.2g}: the student would learn from two; "
+            "check that the expert is the one that was recorded"
+        )
