@@ -65,6 +65,10 @@ def test_where_it_runs_it_keeps_its_own_past(file, tmp_path):
     assert rewards / 2 == pytest.approx(result.evaluation.student_return, rel=1e-3)
     path = result.to_onnx(tmp_path / "s.onnx")
     again = fdtasil.evaluate(path, file, TOY, episodes=2, horizon=20, history=H, progress=False)
+    alone = fdtasil.evaluate(path, file, TOY, episodes=2, horizon=20, progress=False)
+    assert alone == again  # the file says itself how much it sees
+    judged = fdtasil.evaluate(result, file, TOY, episodes=2, horizon=20, progress=False)
+    assert judged.student_return == pytest.approx(again.student_return, rel=1e-3)
     assert again.student_return == pytest.approx(result.evaluation.student_return, rel=1e-3)
 
 
@@ -79,6 +83,8 @@ def test_beside_a_memory_it_is_seen_and_the_memory_is_not(tmp_path):
         path, Remembers(), TOY, episodes=2, horizon=20, history=H, progress=False
     )
     assert again.student_return == pytest.approx(result.evaluation.student_return, rel=1e-3)
+    judged = fdtasil.evaluate(result, Remembers(), TOY, episodes=2, horizon=20, progress=False)
+    assert judged.student_return == pytest.approx(again.student_return, rel=1e-3)
 
 
 class Cart(gymnasium.Env):

@@ -31,10 +31,12 @@ from fdtasil.rollouts.spaces import Spaces
 if TYPE_CHECKING:
     import onnx
 
-__all__ = ["COLUMNS", "open_onnx"]
+__all__ = ["COLUMNS", "HISTORY", "open_onnx", "said_history"]
 
 COLUMNS = "fdtasil.observation_columns"
 """Metadata entry of an exported student that sees some coordinates only."""
+HISTORY = "fdtasil.history"
+"""Metadata entry of one that sees the last observations and actions: how many observations."""
 
 
 def open_onnx(source: str | Path, hints: Hints) -> Expert:
@@ -119,6 +121,28 @@ def _recurrent(
         source=name,
         memory=Memory(k, policy),
     )
+
+
+def said_history(source: object) -> int:
+    """Return how many observations an exported student says that it sees; 1 for what says nothing.
+
+    Args:
+        source: What a policy may be.
+
+    Raises:
+        ExpertError: If it is a file that can't be read.
+    """
+    if not isinstance(source, str | Path) or Path(source).suffix != ".onnx":
+        return 1
+    if "://" in str(source):  # of the hub, or a server: its path says it when it is here
+        return 1
+    model, _ = read_model(Path(source))
+    texts = {entry.key: entry.value for entry in model.metadata_props}
+    text = texts.get(HISTORY, "1")
+    return int(text) if text.isascii() and text.isdigit() and 0 < int(text) < _LONGEST else 1
+
+
+_LONGEST = 1000
 
 
 def _bound(

@@ -14,7 +14,7 @@ from fdtasil.demonstrations.dataset import Dataset, check_shapes
 from fdtasil.demonstrations.states import Demonstrations
 from fdtasil.errors import first_line, warn
 from fdtasil.experts.expert import rows_text
-from fdtasil.experts.onnx_expert import COLUMNS
+from fdtasil.experts.onnx_expert import COLUMNS, HISTORY
 from fdtasil.files.border import reads
 from fdtasil.files.lock import locked
 from fdtasil.files.plain import as_kind, without_infinities
@@ -87,6 +87,13 @@ class Distilled:
 
     def _repr_html_(self) -> str:
         return result_html(self)
+
+    @property
+    def steps_seen(self) -> int:
+        """How many observations the student sees, the present one among them."""
+        past = self.settings.get("past") or 0
+        own = self.settings.get("observation_size", 0) - self.settings.get("remembered", 0) - past
+        return past // (own + self.student.action_size) + 1 if past else 1
 
     @property
     def demonstrations(self) -> Demonstrations:
@@ -224,6 +231,8 @@ class Distilled:
         }
         if self.student.spaces is not None:
             metadata["fdtasil.spaces"] = json.dumps(self.student.spaces.to_json())
+        if self.steps_seen > 1:
+            metadata[HISTORY] = str(self.steps_seen)
         if self.view.columns is not None:
             metadata[COLUMNS] = ",".join(map(str, self.view.columns))
         if self.evaluation is not None:

@@ -16,6 +16,7 @@ from fdtasil.experts.examination import check_first, examine
 from fdtasil.experts.expert import Expert
 from fdtasil.experts.gate import GATE_STATES, compare_again, large_batch
 from fdtasil.experts.load import ExpertLike, expert_in, sized
+from fdtasil.experts.onnx_expert import said_history
 from fdtasil.experts.silence import Silence
 from fdtasil.probes.source import Probes
 from fdtasil.probes.spread import SpreadLike
@@ -270,8 +271,12 @@ def evaluate(
     force = check_flag("force", force)
     limits = None if constraints is None else check_constraints(constraints)
     if isinstance(policy, Distilled):
-        student_obs = policy.view.columns if student_obs is None else student_obs
+        history = max(history, policy.steps_seen)
+        if history == 1 and student_obs is None:
+            student_obs = policy.view.columns
         policy = policy.student
+    elif history == 1 and student_obs is None:
+        history = said_history(policy)
     history = check_history(history, student_obs)
     count, bars = check_count("episodes", episodes), Progress(check_flag("progress", progress))
     with EnvironmentPool(env) as pool, torch_settings(torch.device("cpu")):
