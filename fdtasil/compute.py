@@ -23,7 +23,10 @@ def ask_module(module: torch.nn.Module, observations: np.ndarray) -> np.ndarray:
     like = next(module.parameters(), torch.zeros(()))
     with torch.no_grad():
         batch = torch.from_numpy(np.ascontiguousarray(observations, np.float32))
-        return module(batch.to(like.device, like.dtype)).float().cpu().numpy()
+        found = module(batch.to(like.device, like.dtype))
+    if isinstance(found, torch.Tensor):
+        return found.float().cpu().numpy()
+    return found  # several things, or none: who asks says so
 
 
 def pick_device(device: str) -> torch.device:

@@ -411,3 +411,39 @@ def test_a_function_that_can_not_be_sent_says_how(rows):
     text = error_of(lambda: fdtasil.load_expert(lambda rows: lock and rows, workers=2))
     assert "can't be sent to another process" in text
     assert "threads=True" in text
+
+
+class Several(torch.nn.Module):
+    def forward(self, rows):
+        return {"actions": rows[:, :2], "value": rows[:, 4:]}
+
+
+@pytest.mark.parametrize(
+    ("source", "output", "named"),
+    [
+        (lambda rows: {"u": rows[:, :2], "v": rows[:, 4:]}, "u", "u, v"),
+        (lambda rows: (rows[:, 4:], rows[:, :2], rows[:, :1]), "1", "0, 1, 2"),
+        (Several(), "actions", "actions, value"),
+    ],
+)
+def test_one_of_several_things_is_chosen(source, output, named):
+    rows = np.random.default_rng(0).standard_normal((7, 5)).astype(np.float32)
+    chosen = fdtasil.load_expert(source, 5, 2, output=output)
+    assert np.array_equal(chosen.ask(rows, "check"), rows[:, :2])
+    with pytest.raises(ExpertError, match=rf"\({named}\): say which by output="):
+        fdtasil.load_expert(source, 5, 2).ask(rows, "check")
+    with pytest.raises(ExpertError, match="of which none is 'x'"):
+        fdtasil.load_expert(source, 5, 2, output="x").ask(rows, "check")
+
+
+def test_an_output_of_what_has_none():
+    class Predicts:
+        def predict(self, rows):
+            return rows[:, :2]
+
+    with pytest.raises(SettingError, match="no parts"):
+        fdtasil.load_expert(Predicts(), 5, 2, output="u")
+    with pytest.raises(ExpertError, match="no part 'u'"):
+        fdtasil.load_expert(lambda rows: rows[:, :2], 5, 2, output="u").ask(
+            np.zeros((2, 5)), "check"
+        )

@@ -23,6 +23,7 @@ from fdtasil.experts.memory import Memory, stateless
 from fdtasil.experts.modules import ask_as_it_is, open_module
 from fdtasil.experts.onnx_expert import open_onnx
 from fdtasil.experts.own_jacobian import own_jacobian
+from fdtasil.experts.picking import Picks, PicksOutput
 from fdtasil.experts.predicting import open_predictor
 from fdtasil.experts.sb3.agent import read_agent
 from fdtasil.experts.sb3.recurrent import RecurrentNetwork
@@ -79,7 +80,8 @@ def load_expert(
             derivatives by that.
         observation_size: n, where it is known; checked against the expert.
         action_size: m, where it is known; chooses among the outputs of an ONNX file.
-        output: Name of the ONNX output that holds the actions.
+        output: Name of the ONNX output that holds the actions; of a function or a torch module
+            that returns a dictionary or a tuple, the key or the number of the part.
         inputs: What the inputs of an ONNX file are given, where it has several: a number or an
             array always, or columns of the observation ("0:17"); one that is left out is given
             the other columns.
@@ -127,6 +129,12 @@ def load_expert(
         raise SettingError(
             f"{'memory' if bound is None else 'inputs'}= of a {type(source).__name__}",
             "the path of an ONNX file, whose inputs have names",
+            "leave it out",
+        )
+    if output is not None and kind.opens not in _WITH_OUTPUTS:
+        raise SettingError(
+            f"output={output!r} of a {type(source).__name__}, whose answer has no parts",
+            "an ONNX file, a torch module or a function that returns several things",
             "leave it out",
         )
     hints = Hints(observation_size, action_size, output, trust, timeout, bound, pairs)
@@ -289,6 +297,10 @@ def _from_torch(module: torch.nn.Module, hints: Hints) -> Expert:
     """Ask a module by calling it, unless it has a `predict` that answers otherwise."""
     if getattr(module, "takes_flat_rows", False):  # a student of ours
         return open_module(module)
+    if hints.output is not None:
+        picks = PicksOutput(module, hints.output)
+        found = dataclasses.replace(open_module(picks), own_form=True)
+        return dataclasses.replace(found, name=f"the torch module {type(module).__name__}")
     if not isinstance(module, Predictor) or _is_the_policy(module, hints.observation_size):
         return dataclasses.replace(open_module(module), own_form=True)
     return _from_predictor(module, hints)
@@ -318,6 +330,8 @@ def _from_predictor(source: Predictor, hints: Hints) -> Expert:
 
 def _from_function(function: Callable[[np.ndarray], np.ndarray], hints: Hints) -> Expert:
     name = getattr(function, "__name__", type(function).__name__)
+    if hints.output is not None:
+        return Expert(Picks(function, hints.output), f"the function {name}", own_form=True)
     given = own_jacobian(function)
     return Expert(function, f"the function {name}", jacobian=given, own_form=True)
 
@@ -361,3 +375,5 @@ KINDS = (
     Kind(callable, _from_function),
 )
 """Every kind of expert; the first that recognises a source opens it."""
+
+_WITH_OUTPUTS = (open_onnx, _from_torch, _from_function)

@@ -60,6 +60,11 @@ def as_array(answer: Any) -> Any:
         if answer[1] is not None and np.ndim(answer[1]) != 3:  # derivatives, (B, m, n)
             raise TypeError("it returned a second value beside the actions, such as a state")
         found = answer[0]
+    if isinstance(answer, (dict, tuple)) and found is answer and not _is_array(answer):
+        parts = list(answer) if isinstance(answer, dict) else list(range(len(answer)))
+        named = ", ".join(map(str, parts[:8]))
+        kind = type(answer).__name__
+        raise TypeError(f"it returned a {kind} of several things ({named}): say which by output=")
     if hasattr(found, "detach"):  # torch is not imported where the expert does not need it
         found = found.detach().cpu().float().numpy()
     if np.ma.is_masked(found):
@@ -71,6 +76,18 @@ def as_array(answer: Any) -> Any:
     if found.dtype.kind not in "biufO" or texts:  # numpy reads numbers out of texts and dates
         raise TypeError(f"it returned {'texts' if texts else f'values of {found.dtype}'}")
     return np.array(found, dtype=np.float32, order="C")
+
+
+def _is_array(answer: Any) -> bool:
+    """Whether a tuple is rows of numbers, and not several things."""
+    import numpy as np
+
+    if isinstance(answer, dict):
+        return False
+    try:
+        return np.asarray(answer).dtype.kind in "biuf"
+    except ValueError:  # of several shapes
+        return False
 
 
 def main() -> None:

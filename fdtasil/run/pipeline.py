@@ -270,6 +270,7 @@ def evaluate(
     check_count("seed", seed, 0, 2**32 - 1)
     force = check_flag("force", force)
     limits = None if constraints is None else check_constraints(constraints)
+    history = check_count("history", history)
     if isinstance(policy, Distilled):
         history = max(history, policy.steps_seen)
         if history == 1 and student_obs is None:
