@@ -93,7 +93,7 @@ class Distilled:
         """How many observations the student sees, the present one among them."""
         past = self.settings.get("past") or 0
         own = self.settings.get("observation_size", 0) - self.settings.get("remembered", 0) - past
-        return past // (own + self.student.action_size) + 1 if past else 1
+        return past // max(1, own + self.student.action_size) + 1 if past > 0 else 1
 
     @property
     def demonstrations(self) -> Demonstrations:
@@ -204,6 +204,8 @@ class Distilled:
     def _read(cls, folder: Path, student_obs: StudentObservation | None) -> "Distilled":
         files = verify(folder)
         settings = unstamped(files[CONFIG], folder / CONFIG, older=True)
+        for name in _COUNTS & settings.keys():
+            as_kind(int, settings[name], name)
         report = _read_report(files["report.json"])
         dataset = Dataset.from_bytes(files["demonstrations.npz"])
         check_shapes(dataset)
@@ -314,6 +316,7 @@ def _stored_view(
     return View(Unseen(stored), None, 0, np.ones(states.shape[1], bool))
 
 
+_COUNTS = {"observation_size", "past", "remembered"}
 _REPORT = {"env": str, "probes": str, "steps": int, "warnings": tuple[str, ...]}
 """Types of what is used of a report later on."""
 
