@@ -17,7 +17,7 @@ from fdtasil.files.names import check_no_links, stays_inside
 from fdtasil.files.reading import from_json, read_plain
 from fdtasil.files.storage import remove_folder
 from fdtasil.rollouts.flattening import bounds_of
-from fdtasil.rollouts.spaces import Mismatch, Spaces, UnknownSpace, layout_of
+from fdtasil.rollouts.spaces import Mismatch, Spaces, UnknownSpace
 
 if TYPE_CHECKING:
     import minari
@@ -83,10 +83,7 @@ def _dataset_of(source: "str | minari.MinariDataset", minari: Any) -> Dataset:
 
 def _spaces_of(data: "minari.MinariDataset") -> Spaces:
     try:
-        return Spaces(
-            layout_of(data.observation_space, "observations"),
-            layout_of(data.action_space, "actions"),
-        )
+        return Spaces.of(data)
     except UnknownSpace as unknown:
         raise SettingError(
             f"a dataset with {shown(str(unknown))}",

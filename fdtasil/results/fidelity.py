@@ -65,7 +65,7 @@ def fidelity_of(
     steps = unit * np.where(live, scales.deviation, 0.0)
     theirs, ours = expert.ask(states, "check"), student(states)
     errors, floors = [], []
-    noise = _noise(expert, states, steps[:, 0])
+    noise = _noise(expert, states, theirs, steps[:, 0])
     for radius in RADII:
         points = (states[:, None] + radius * steps).astype(np.float32).reshape(-1, n)
         said = expert.ask(points, "check").reshape(count, _DIRECTIONS, -1)
@@ -87,9 +87,9 @@ def _share(part: float, whole: float) -> float:
     return part / whole if whole > 0 else 0.0 if part == 0 else float("inf")
 
 
-def _noise(expert: Expert, states: np.ndarray, steps: np.ndarray) -> float:
+def _noise(expert: Expert, states: np.ndarray, theirs: np.ndarray, steps: np.ndarray) -> float:
     """Return the root mean square error of an action, by second differences very near."""
     near = 1e-4 * steps
     sides = [expert.ask((states + sign * near).astype(np.float32), "check") for sign in (1, -1)]
-    second = sides[0].astype(np.float64) + sides[1] - 2 * expert.ask(states, "check")
+    second = sides[0].astype(np.float64) + sides[1] - 2 * theirs
     return float(np.sqrt(np.nanmean(second**2) / 6))

@@ -301,10 +301,7 @@ def _time_limit(environment: gymnasium.Env) -> int | None:
 
 def _spaces_of(environment: gymnasium.Env | Together, name: str) -> Spaces:
     try:
-        return Spaces(
-            layout_of(environment.observation_space, "observations"),
-            layout_of(environment.action_space, "actions"),
-        )
+        return Spaces.of(environment)
     except UnknownSpace as unknown:
         raise EnvironmentFault(
             f"{name} has {unknown}",

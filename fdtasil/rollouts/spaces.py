@@ -312,6 +312,21 @@ class Spaces:
         """Whether both are their own flat forms."""
         return self.observations.plain and self.actions.plain
 
+    @classmethod
+    def of(cls, source: Any) -> "Spaces":
+        """Read the spaces of an environment, a vector of them, or a dataset.
+
+        Args:
+            source: Has an `observation_space` and an `action_space`.
+
+        Raises:
+            UnknownSpace: If one of them has no flat form.
+        """
+        return cls(
+            layout_of(source.observation_space, "observations"),
+            layout_of(source.action_space, "actions"),
+        )
+
     def to_json(self) -> dict[str, Any]:
         """Return the spaces as plain JSON values."""
         return {name: layout.to_json() for name, layout in vars(self).items()}
