@@ -137,7 +137,7 @@ def test_what_a_history_does_not_go_with_is_refused(file):
     with pytest.raises(SettingError, match="of a student that sees 19 numbers"):
         fdtasil.History(result.student, 2)
     dataset = fdtasil.distill(file, TOY, 0, **{**RUN, "history": 1}).dataset
-    with pytest.raises(SettingError, match="without an environment"):
+    with pytest.raises(SettingError, match="history=2 with a dataset that shows 1"):
         fdtasil.distill(file, None, 3, dataset=dataset, history=2, progress=False)
 
 
@@ -157,3 +157,30 @@ def test_constraints_are_of_the_environments_own_observations(file):
 
     fdtasil.distill(file, TOY, 0, **RUN, constraints={"limit": limit})
     assert set(seen) == {N}
+
+
+@pytest.mark.parametrize("history", [1, H])
+def test_what_was_recorded_with_a_memory_is_learnt_again_without_asking(history, tmp_path):
+    run = {**RUN, "history": history}
+    first = fdtasil.distill(Remembers(), TOY, 3, **run, out=tmp_path / "run")
+    alone = fdtasil.distill(None, None, dataset=tmp_path / "run", progress=False, fit=RUN["fit"])
+    assert sum(alone.queries.values()) == 0
+    assert alone.student.observation_size == first.student.observation_size
+    states = first.demonstrations.observations[:5]
+    assert (alone.student.act(alone.view.look(states)) != 0).all()
+    again = fdtasil.distill(Remembers(), TOY, dataset=first.dataset, **{**run, "history": 1})
+    assert again.student.to_bytes() == first.student.to_bytes()
+    assert again.evaluation == first.evaluation
+    assert again.queries["act"] == 0
+    stored = fdtasil.Dataset.from_bytes(first.dataset.to_bytes())
+    assert (stored.history, stored.remembered, stored.own_size) == (history, 6, N)
+
+
+def test_another_past_or_memory_than_the_datasets_is_refused(file):
+    with_memory = fdtasil.distill(Remembers(), TOY, 0, **RUN).dataset
+    with pytest.raises(SettingError, match="remembers nothing, beside states of one"):
+        fdtasil.distill(file, TOY, dataset=with_memory, progress=False)
+    with pytest.raises(SettingError, match="history=2 with a dataset that shows 3"):
+        fdtasil.distill(Remembers(), TOY, dataset=with_memory, history=2, progress=False)
+    with pytest.raises(SettingError, match="with student_obs"):
+        fdtasil.distill(Remembers(), TOY, dataset=with_memory, student_obs=[0], progress=False)

@@ -118,5 +118,8 @@ def test_students_see_what_the_runs_student_saw():
     found = fdtasil.shrink(some, law, TOY, **options)
     assert found.result.student.observation_size == 3
     past = fdtasil.distill(law, TOY, 2, history=2, **QUICK)
-    with pytest.raises(SettingError, match="a history"):
-        fdtasil.shrink(past, law, TOY, **options)
+    found = fdtasil.shrink(past, law, TOY, **options)
+    assert found.result.student.observation_size == past.student.observation_size
+    through = fdtasil.distill(law, TOY, 2, student_obs=lambda rows: rows[:, :2], **QUICK)
+    with pytest.raises(SettingError, match="sees through"):
+        fdtasil.shrink(through, law, TOY, **options)

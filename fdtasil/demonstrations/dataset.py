@@ -15,6 +15,7 @@ from fdtasil.demonstrations.states import Demonstrations
 from fdtasil.errors import SettingError, StorageError
 from fdtasil.files.arrays import arrays_from_bytes
 from fdtasil.files.border import reads
+from fdtasil.files.plain import as_kind
 from fdtasil.files.reading import from_json, read_plain
 from fdtasil.files.storage import is_written, verify
 from fdtasil.probes.answers import Answers
@@ -38,6 +39,9 @@ class Dataset:
         high: (m,) upper action bounds.
         environment: What the environment is called.
         spaces: Of the environment, where they are no plain boxes.
+        history: How many observations the student sees; behind the environment's own stand those
+            before it, with the actions then.
+        remembered: Length of what the expert remembered there, which stands last.
     """
 
     demonstrations: Demonstrations
@@ -47,6 +51,8 @@ class Dataset:
     high: np.ndarray
     environment: str
     spaces: Spaces | None = None
+    history: int = 1
+    remembered: int = 0
 
     def __repr__(self) -> str:
         """Return a line, not the arrays."""
@@ -63,6 +69,12 @@ class Dataset:
         states = self.demonstrations
         return states.observations.shape[1], states.actions.shape[1]
 
+    @property
+    def own_size(self) -> int:
+        """Length of the environment's own observation, which past and memory stand behind."""
+        n, m = self.sizes
+        return (n - self.remembered - (self.history - 1) * m) // self.history
+
     def to_bytes(self) -> bytes:
         """Return the dataset as an npz file.
 
@@ -72,8 +84,8 @@ class Dataset:
         `low` and `high` (m,) float32; with probes also `displacements` (P, n) float32, `numbers`
         (N, k) int32, `values` (N, k, p, m) float32 and `gains` (P,) float64 as in `Answers` (one
         `gain` () in version 1); and
-        `about`, JSON text as bytes: version, environment, probes, and spaces where they are no
-        plain boxes.
+        `about`, JSON text as bytes: version, environment, probes, and where they are not the
+        usual ones spaces, history and remembered.
         """
         arrays: dict[str, Any] = dict(vars(self.demonstrations))
         arrays |= {"low": self.low, "high": self.high}
@@ -86,6 +98,8 @@ class Dataset:
         }
         if self.spaces is not None:
             about["spaces"] = self.spaces.to_json()
+        if self.history > 1 or self.remembered:
+            about |= {"history": self.history, "remembered": self.remembered}
         arrays["about"] = np.frombuffer(json.dumps(about).encode(), np.uint8)
         target = io.BytesIO()
         np.savez(target, **arrays)
@@ -281,7 +295,15 @@ def _read(arrays: Mapping[str, np.ndarray]) -> Dataset:
         answers = Answers(bank, numbers, values, gains)
     bounds = typed["low"], typed["high"]
     spaces = Spaces.from_json(about["spaces"]) if "spaces" in about else None
-    found = Dataset(demonstrations, _probes(spec, answers), answers, *bounds, environment, spaces)
+    behind = (as_kind(int, about.get("history", 1), "history"),)
+    behind += (as_kind(int, about.get("remembered", 0), "remembered"),)
+    found = Dataset(
+        demonstrations, _probes(spec, answers), answers, *bounds, environment, spaces, *behind
+    )
+    n, m = found.sizes
+    own = n - found.remembered - (found.history - 1) * m
+    if found.history < 1 or found.remembered < 0 or own < found.history or own % found.history:
+        raise ValueError(f"{n} observations with history {behind[0]} and memory {behind[1]}")
     if spaces and spaces.actions.size != found.sizes[1]:
         raise ValueError("actions of another size than their space")
     return found

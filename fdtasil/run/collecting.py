@@ -37,6 +37,8 @@ class Collecting:
         seed: Of starts and noise.
         progress: Progress bars.
         keep: Which of the expert's own episodes are kept.
+        history: How many observations the student sees.
+        remembered: Length of the expert's memory.
     """
 
     trainer: Trainer
@@ -46,6 +48,8 @@ class Collecting:
     seed: int
     progress: Progress
     keep: str
+    history: int
+    remembered: int
 
     def record(
         self, round_: int, count: int, before: Collected | None, student: Policy | None
@@ -82,7 +86,8 @@ class Collecting:
         counts["replaced_episodes"] += replaced
         counts["given_up_episodes"] += int(episodes.given_up.sum())
         spaces = None if self.pool.spaces.plain else self.pool.spaces
-        dataset = Dataset(states, None, None, boxes.low, boxes.high, self.pool.name, spaces)
+        about = self.pool.name, spaces, self.history, self.remembered
+        dataset = Dataset(states, None, None, boxes.low, boxes.high, *about)
         return Collected(dataset, first + len(episodes.valid), counts)
 
     def check_kept(self, kept: Collected) -> None:

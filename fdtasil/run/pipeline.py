@@ -43,7 +43,7 @@ from fdtasil.run.judging import judged_in
 from fdtasil.run.lesson import Lesson
 from fdtasil.run.report import config_of, no_answer, report_of
 from fdtasil.run.rounds import Rounds
-from fdtasil.run.subject import Subject, named, open_subject, visible
+from fdtasil.run.subject import Subject, history_with, named, open_subject, visible
 from fdtasil.run.training import Training
 from fdtasil.seeding import episode_seeds
 from fdtasil.student.architectures import Architecture
@@ -174,9 +174,10 @@ def distill(
     """
     folder, force = _folder_of(out, resume), check_flag("force", force)
     limits = None if constraints is None else check_constraints(constraints)
-    history = check_history(history, student_obs)
     progress = check_flag("progress", progress)
     given = None if dataset is None else load_dataset(dataset)
+    history = history_with(check_history(history, student_obs), given)
+    check_history(history, student_obs)
     arguments = read_arguments(
         given,
         probes,
@@ -335,7 +336,17 @@ def _collecting(run: Configuration, subject: Subject, bars: Progress) -> Collect
     expert, pool = subject.expert, subject.pool
     if run.trainer is None or expert is None or pool is None:
         return None
-    return Collecting(run.trainer, expert, pool, run.horizon, run.seed, bars, run.keep)
+    return Collecting(
+        run.trainer,
+        expert,
+        pool,
+        run.horizon,
+        run.seed,
+        bars,
+        run.keep,
+        subject.history,
+        subject.remembered,
+    )
 
 
 def _complete(

@@ -227,20 +227,16 @@ def _seen(result: Distilled) -> tuple[int, ...] | None:
     """Return what the students of a run see.
 
     Raises:
-        SettingError: If no dataset says it: a function, a history, an expert's memory.
+        SettingError: If it is a function, which no file says.
     """
-    settings = result.settings
-    if settings.get("past") or settings.get("remembered"):
-        found = "a history" if settings.get("past") else "an expert with a memory"
-    elif isinstance(settings["student_obs"], str):
-        found = f"a student that sees through {settings['student_obs']}"
-    else:
-        return result.view.columns
-    raise SettingError(
-        f"a run with {found}",
-        "one whose student sees the observation, or some of its coordinates",
-        "distil each size anew: distill(..., student=fdtasil.Mlp((64, 64)))",
-    )
+    through = result.settings["student_obs"]
+    if isinstance(through, str):
+        raise SettingError(
+            f"a run with a student that sees through {through}",
+            "one whose student sees the observation, or some of its coordinates",
+            "distil each size anew: distill(..., student=fdtasil.Mlp((64, 64)))",
+        )
+    return result.view.columns if result.dataset.history == 1 else None
 
 
 @dataclass(frozen=True)

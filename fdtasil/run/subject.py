@@ -12,10 +12,11 @@ from fdtasil.experts.expert import Expert
 from fdtasil.experts.load import ExpertLike, expert_in, load_expert
 from fdtasil.experts.structure import in_spaces
 from fdtasil.rollouts.environments import EnvironmentLike, EnvironmentPool
+from fdtasil.rollouts.history import past_size
 from fdtasil.rollouts.spaces import Layout, Spaces
 from fdtasil.student.view import StudentObservation, describe_view
 
-__all__ = ["Subject", "named", "open_subject", "visible"]
+__all__ = ["Subject", "history_with", "named", "open_subject", "visible"]
 
 
 @dataclass(frozen=True)
@@ -28,7 +29,8 @@ class Subject:
         environment: What to call it.
         observation_size: n; behind the environment's own stand past and memory.
         action_size: m.
-        past: Length of the past that the student sees.
+        history: How many observations the student sees.
+        past: Length of those before the present one, with the actions then.
         remembered: Length of the expert's memory; 0 where it has none.
         spaces: Of the environment, where they are no plain boxes.
     """
@@ -38,6 +40,7 @@ class Subject:
     environment: str
     observation_size: int
     action_size: int
+    history: int = 1
     past: int = 0
     remembered: int = 0
     spaces: Spaces | None = None
@@ -61,10 +64,11 @@ def open_subject(
         expert: The expert.
         env: The environment.
         given: A dataset.
-        history: How many observations the student sees.
+        history: How many observations the student sees; those of the dataset where it is given.
 
     Raises:
-        SettingError: If something is missing that nothing replaces.
+        SettingError: If something is missing that nothing replaces, or the dataset shows another
+            past or memory.
         ExpertError: If the expert can't be opened.
         EnvironmentFault: If the environment can't be used, or does not fit the demonstrations.
     """
@@ -79,20 +83,46 @@ def open_subject(
             spaces = None if pool.spaces.plain else pool.spaces
         else:
             assert given is not None
-            n, m, name, spaces = *given.sizes, given.environment, given.spaces
-        if given is not None and given.sizes != (n, m):
+            n, m = given.own_size, given.sizes[1]
+            name, spaces = given.environment, given.spaces
+        if given is not None and (found := (given.own_size, given.sizes[1])) != (n, m):
             raise SettingError(
-                f"a dataset with (observations, actions) of sizes {given.sizes}",
+                f"a dataset with (observations, actions) of sizes {found}",
                 f"{(n, m)}, as {name}",
                 "pass the environment that they were recorded in, or none",
             )
-        opened, past, remembered = None, 0, 0
+        opened, past = None, past_size(history, n, m)
+        remembered = given.remembered if given is not None else 0
         if expert is not None:
             found = load_expert(expert, n, m) if pool is None else expert_in(expert, pool)
             found = in_spaces(found, spaces)
             opened, past, remembered = carry(found, pool, history)
+            if given is not None and given.remembered != remembered:
+                raise SettingError(
+                    f"{opened.name}, which remembers {remembered or 'nothing'}, beside states of "
+                    f"one that remembered {given.remembered or 'nothing'}",
+                    "the expert that they were recorded with",
+                    "pass it, or none: then nobody is asked",
+                )
         size = n + past + remembered
-        yield Subject(opened, pool, name, size, m, past, remembered, spaces)
+        yield Subject(opened, pool, name, size, m, history, past, remembered, spaces)
+
+
+def history_with(history: int, given: Dataset | None) -> int:
+    """Return how many observations a student sees: as many as a dataset shows, if one is given.
+
+    Raises:
+        SettingError: If another number is asked for.
+    """
+    if given is None or given.history == history:
+        return history
+    if history == 1:
+        return given.history
+    raise SettingError(
+        f"history={history} with a dataset that shows {given.history} observation(s)",
+        f"history={given.history}",
+        "leave history= out, or record with that history",
+    )
 
 
 def named(
