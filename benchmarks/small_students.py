@@ -1,0 +1,164 @@
+"""The smallest student that keeps the level, with probes and without, and judged as compiled C."""
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+
+import fdtasil
+from benchmarks.controllers import CONTROLLERS, available
+from benchmarks.distillation import HORIZON
+from benchmarks.grid import SEEDS
+from benchmarks.panels import draw_panels
+from benchmarks.runner import Benchmark, Cell, Row
+from benchmarks.statistics import interval_text
+from benchmarks.tables import table
+from fdtasil.files.compiled import shared_function
+
+__all__ = ["BENCHMARK"]
+
+EPISODES = 5
+KEEP = 0.95
+WIDTHS = (16, 32, 64, 128, 256)
+_NAMES = {False: "fresh", True: "plain cloning"}  # by whether it is cloned
+_CALLS, _ROUNDS = 1000, 5
+
+
+def cells(quick: bool) -> list[Cell]:
+    """Every expert and seed."""
+    return [
+        {"expert": expert, "seed": seed}
+        for seed in (SEEDS[:2] if quick else SEEDS)
+        for expert in (available("HalfCheetah-v5") if quick else available())
+    ]
+
+
+def run(cell: Cell, device: str) -> dict[str, Any]:
+    """Record once, train students of every width, and judge the smallest that keeps the level."""
+    path, env = CONTROLLERS[cell["expert"]].open()
+    recorded = fdtasil.distill(
+        path,
+        env,
+        episodes=EPISODES,
+        horizon=HORIZON,
+        seed=cell["seed"],
+        fit=fdtasil.Fit(steps=1),
+        evaluation_episodes=0,
+        device=device,
+        progress=False,
+    )
+    sizes = [(width, width) for width in WIDTHS]
+    found = fdtasil.shrink(recorded, path, env, keep=KEEP, sizes=sizes, progress=False)
+    names = ("hidden", "cloned", "bytes", "multiply_adds", "normalized_return", "ci95", "survival")
+    students = [{name: getattr(one, name) for name in names} for one in found.candidates]
+    result = {"students": students, "expert_bytes": path.stat().st_size}
+    if found.result is not None:
+        result["smallest"] = _as_c(found.result, path, env, cell["seed"])
+    return result
+
+
+def _as_c(result: fdtasil.Distilled, path: Path, env: str, seed: int) -> dict[str, Any]:
+    """Return how the compiled student does in the loop, and how long one answer takes."""
+    with TemporaryDirectory() as folder:
+        file = result.export(Path(folder) / "student.c")
+        compiled = fdtasil.load_expert(file, trust="c")
+        judged = fdtasil.evaluate(compiled, path, env, horizon=HORIZON, seed=seed, progress=False)
+        return {
+            "hidden": list(result.student.architecture.hidden),  # pyright: ignore
+            "c_return": judged.normalized_return,
+            "c_ci95": judged.ci95,
+            "c_bytes": file.stat().st_size,
+            "c_microseconds": _microseconds(file.read_text(), result.student),
+        }
+
+
+def _microseconds(source: str, student: fdtasil.Student) -> float:
+    function = shared_function(source, "student")
+    seen = np.zeros(student.observation_size, np.float32)
+    done = np.zeros(student.action_size, np.float32)
+    places, taken = (seen.ctypes.data, done.ctypes.data), []
+    for _ in range(_ROUNDS):
+        start = time.perf_counter()
+        for _ in range(_CALLS):
+            function(*places)
+        taken.append((time.perf_counter() - start) / _CALLS)
+    return round(1e6 * min(taken), 2)
+
+
+def draw(rows: Sequence[Row]) -> dict[str, bytes]:
+    """One table of the smallest students, one of all sizes, and a picture of these."""
+    experts = list(dict.fromkeys(row["cell"]["expert"] for row in rows))
+    found = {
+        expert: [row["result"] for row in rows if row["cell"]["expert"] == expert]
+        for expert in experts
+    }
+    found = {expert: results for expert, results in found.items() if len(results) > 1}
+    heads = ["expert", "smallest of each seed", "bytes at most", "its C code in the loop"]
+    heads += ["microseconds as C", "smallest cloned"]
+    small = table(heads, [_smallest(expert, results) for expert, results in found.items()])
+    every = table(["expert", "", *(f"{w} x {w}" for w in WIDTHS)], _every(found))
+    curves = {expert: _curves(results) for expert, results in found.items()}
+    files = {"small_students.md": f"{small}\n{every}".encode()}
+    if curves:
+        files["small_students.png"] = draw_panels(curves, "width of two hidden layers")
+    return files
+
+
+def _smallest(expert: str, results: Sequence[Any]) -> list[str]:
+    kept = [result.get("smallest") for result in results]
+    there = [one for one in kept if one is not None]
+    sizes = [_first(result, cloned=False) for result in results]
+    most = max((one["bytes"] for one in sizes if one is not None), default=None)
+    return [
+        expert,
+        _widths(sizes),
+        "-" if most is None else f"{most:,}",
+        interval_text([one["c_return"] for one in there]) if len(there) > 1 else "-",
+        f"{np.mean([one['c_microseconds'] for one in there]):.1f}" if there else "-",
+        _widths([_first(result, cloned=True) for result in results]),
+    ]
+
+
+def _first(result: Any, *, cloned: bool) -> Any:
+    """Return the smallest student of a seed whose interval begins above the level, or None."""
+    return next(
+        (
+            one
+            for one in sorted(result["students"], key=lambda one: one["bytes"])
+            if one["cloned"] == cloned and one["ci95"] is not None and one["ci95"][0] >= KEEP
+        ),
+        None,
+    )
+
+
+def _widths(students: Sequence[Any]) -> str:
+    return ", ".join("none" if one is None else str(one["hidden"][0]) for one in students)
+
+
+def _every(found: dict[str, list[Any]]) -> list[list[str]]:
+    return [
+        [expert, name, *(interval_text(scores) for scores in curve.values())]
+        for expert, results in found.items()
+        for name, curve in _curves(results).items()
+    ]
+
+
+def _curves(results: Sequence[Any]) -> dict[str, dict[float, list[float]]]:
+    return {
+        name: {
+            width: [
+                one["normalized_return"]
+                for result in results
+                for one in result["students"]
+                if one["cloned"] == cloned and one["hidden"][0] == width
+            ]
+            for width in WIDTHS
+        }
+        for cloned, name in _NAMES.items()
+    }
+
+
+BENCHMARK = Benchmark("small_students", __doc__ or "", cells, run, draw)
