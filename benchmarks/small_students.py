@@ -1,7 +1,7 @@
 """The smallest student that keeps the level, with probes and without, and judged as compiled C."""
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -24,6 +24,7 @@ EPISODES = 5
 KEEP = 0.95
 WIDTHS = (16, 32, 64, 128, 256)
 _NAMES = {False: "fresh", True: "plain cloning"}  # by whether it is cloned
+_WAYS = ("c", "onnx")
 _CALLS, _ROUNDS = 1000, 5
 
 
@@ -71,19 +72,36 @@ def _as_c(result: fdtasil.Distilled, path: Path, env: str, seed: int) -> dict[st
             "c_return": judged.normalized_return,
             "c_ci95": judged.ci95,
             "c_bytes": file.stat().st_size,
-            "c_microseconds": _microseconds(file.read_text(), result.student),
+            "c_microseconds": _c_microseconds(file.read_text(), result.student),
+            "onnx_microseconds": _onnx_microseconds(result.export_bytes("student.onnx")),
         }
 
 
-def _microseconds(source: str, student: fdtasil.Student) -> float:
+def _c_microseconds(source: str, student: fdtasil.Student) -> float:
     function = shared_function(source, "student")
     seen = np.zeros(student.observation_size, np.float32)
     done = np.zeros(student.action_size, np.float32)
-    places, taken = (seen.ctypes.data, done.ctypes.data), []
+    places = seen.ctypes.data, done.ctypes.data
+    return _microseconds(lambda: function(*places))
+
+
+def _onnx_microseconds(data: bytes) -> float:
+    import onnxruntime
+
+    options = onnxruntime.SessionOptions()
+    options.intra_op_num_threads = 1
+    session = onnxruntime.InferenceSession(data, options)
+    (given,) = session.get_inputs()
+    row = {given.name: np.zeros((1, given.shape[1]), np.float32)}
+    return _microseconds(lambda: session.run(None, row))
+
+
+def _microseconds(call: Callable[[], object]) -> float:
+    taken = []
     for _ in range(_ROUNDS):
         start = time.perf_counter()
         for _ in range(_CALLS):
-            function(*places)
+            call()
         taken.append((time.perf_counter() - start) / _CALLS)
     return round(1e6 * min(taken), 2)
 
@@ -97,7 +115,7 @@ def draw(rows: Sequence[Row]) -> dict[str, bytes]:
     }
     found = {expert: results for expert, results in found.items() if len(results) > 1}
     heads = ["expert", "smallest of each seed", "bytes at most", "its C code in the loop"]
-    heads += ["microseconds as C", "smallest cloned"]
+    heads += ["microseconds as C, in onnxruntime", "smallest cloned"]
     small = table(heads, [_smallest(expert, results) for expert, results in found.items()])
     every = table(["expert", "", *(f"{w} x {w}" for w in WIDTHS)], _every(found))
     curves = {expert: _curves(results) for expert, results in found.items()}
@@ -117,7 +135,9 @@ def _smallest(expert: str, results: Sequence[Any]) -> list[str]:
         _widths(sizes),
         "-" if most is None else f"{most:,}",
         interval_text([one["c_return"] for one in there]) if len(there) > 1 else "-",
-        f"{np.mean([one['c_microseconds'] for one in there]):.1f}" if there else "-",
+        ", ".join(f"{np.mean([one[f'{way}_microseconds'] for one in there]):.1f}" for way in _WAYS)
+        if there
+        else "-",
         _widths([_first(result, cloned=True) for result in results]),
     ]
 
