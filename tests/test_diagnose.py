@@ -134,3 +134,39 @@ def test_the_command(tmp_path, inside):
     )
     assert done.returncode == 0, done.stderr
     assert "closed loop" in done.stdout
+
+
+def lqr(rows):
+    """Balances the pendulum, by its place, angle and their speeds."""
+    return np.asarray(rows) @ np.array([[0.25, 4.25, 0.39, 0.68]]).T
+
+
+def test_the_linearised_loop_is_the_simulators_own():
+    """A small deviation is followed in the environment itself, one step of it."""
+    found = fdtasil.diagnose(
+        lambda rows: 0.5 * lqr(rows), lqr, "InvertedPendulum-v5", episodes=2, horizon=20
+    )
+    env, columns = gymnasium.make("InvertedPendulum-v5").unwrapped, []
+    env.reset(seed=0)
+    for along in 1e-4 * np.eye(4):
+        ends = []
+        for sign in (1, -1):
+            state = sign * along
+            env.set_state(state[:2], state[2:])
+            ends.append(env.step(lqr(env._get_obs()[None])[0])[0])
+        columns.append((ends[0] - ends[1]) / 2e-4)
+    expected = np.abs(np.linalg.eigvals(np.stack(columns, axis=1))).max()
+    assert expected < 1
+    assert found.linearisation.expert == pytest.approx([expected] * 6, rel=0.01)
+    assert min(found.linearisation.student) > expected + 0.001
+    assert "linearised loops" in str(found)
+
+
+def test_what_is_no_such_simulator_has_no_linearised_loop():
+    found = fdtasil.diagnose(rest, rest, lambda: PowerLaw(1.0), episodes=2, horizon=20)
+    assert found.linearisation is None
+    scaled = gymnasium.wrappers.TransformObservation(
+        gymnasium.make("InvertedPendulum-v5"), lambda seen: 2 * seen, None
+    )
+    found = fdtasil.diagnose(lqr, lqr, scaled, episodes=2, horizon=20)
+    assert found.linearisation is None

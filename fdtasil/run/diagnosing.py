@@ -15,6 +15,7 @@ from fdtasil.files.plain import to_plain
 from fdtasil.probes.scales import measure_scales
 from fdtasil.progress import Progress
 from fdtasil.results.fidelity import Fidelity, fidelity_of
+from fdtasil.results.linearisation import Linearisation, linearise
 from fdtasil.results.stability import Stability, distances, stability_of
 from fdtasil.rollouts.behaviours import follow
 from fdtasil.rollouts.environments import EnvironmentLike, EnvironmentPool, resolve_horizon
@@ -27,6 +28,7 @@ from fdtasil.student.view import View
 __all__ = ["Diagnosis", "diagnose"]
 
 _STATES = 64
+_LOOKED = 4  # episodes whose loop is linearised, at three states each
 
 
 @dataclass(frozen=True)
@@ -42,6 +44,8 @@ class Diagnosis:
             None where no law was found.
         gap: How far it did lead: largest distance of the two paths, averaged over episodes.
         queries: Rows that the expert answered.
+        linearisation: Eigenvalues of both closed loops along the expert's path; None where the
+            environment is no MuJoCo environment of gymnasium.
     """
 
     fidelity: Fidelity
@@ -50,6 +54,7 @@ class Diagnosis:
     bound: float | None
     gap: float
     queries: int
+    linearisation: Linearisation | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Return the diagnosis as plain JSON values."""
@@ -76,6 +81,8 @@ class Diagnosis:
         law = "no law, no bound" if self.bound is None else f"at most {self.bound:.2g} by that law"
         lines.append(f"the student's largest error on its own path: {self.largest_error:.2g}")
         lines.append(f"its distance to the expert's path: {self.gap:.2g} deviations ({law})")
+        if self.linearisation is not None:
+            lines.append(f"linearised loops: {self.linearisation}")
         return "\n".join(lines)
 
 
@@ -159,6 +166,8 @@ def diagnose(
         errors[path.valid] = np.linalg.norm(np.nan_to_num(apart), axis=1)
         largest = float(errors.max(axis=1).mean())
         gap = float(distances(first, path, scales).mean())
+        looked = sorted({0, short // 2, short - 1})
+        loops = linearise(pool, asked.policy("evaluate"), act, starts[:_LOOKED], looked)
         return Diagnosis(
             fidelity,
             stability,
@@ -166,4 +175,5 @@ def diagnose(
             stability.gamma(largest),
             gap,
             sum(asked.queries.values()),
+            loops,
         )
