@@ -85,7 +85,8 @@ def linearise(
                 break
     if not found:
         return None
-    return Linearisation(*map(tuple, zip(*found, strict=True)))
+    looked, theirs, ours = zip(*found, strict=True)
+    return Linearisation(looked, theirs, ours)
 
 
 def _is_mujoco(simulator: Any, actions: int) -> bool:
