@@ -3,6 +3,7 @@
 import copy
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -78,8 +79,8 @@ def linearise(
             if not np.allclose(_observed(simulator), np.ravel(seen), atol=1e-5):
                 return None
             if step in steps:
-                sizes = (_largest(simulator, pool.bounds, act) for act in (expert, student))
-                found.append((step, *sizes))
+                size_of = partial(_largest, simulator, pool.bounds)
+                found.append((step, size_of(expert), size_of(student)))
             seen, _, terminated, truncated, _ = env.step(_acted(expert, seen, pool.bounds))
             if terminated or truncated:
                 break
