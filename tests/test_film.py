@@ -66,6 +66,14 @@ def test_an_mp4(tmp_path):
     assert about["size"][0] == 2 * about["source_size"][0] // 2
 
 
+def test_a_student_with_a_history_keeps_it(tmp_path):
+    law = lambda x: np.clip(-x[:, :2], -1, 1)  # noqa: E731
+    result = fdtasil.distill(law, Drawn, 2, **QUICK, history=2)
+    file = result.export(tmp_path / "s.onnx")
+    film = fdtasil.render({"past": file}, Drawn, tmp_path / "f.gif", horizon=5)
+    assert Image.open(film).n_frames > 1
+
+
 def test_students_of_every_form(tmp_path):
     law = lambda x: np.clip(-x[:, :2], -1, 1)  # noqa: E731
     expert = in_form(law, "nested", "choice")

@@ -77,7 +77,7 @@ def _dataset_of(source: "str | minari.MinariDataset", minari: Any) -> Dataset:
     ends = bounds_of(data.action_space, spaces.actions)
     low, high = (np.asarray(bound, np.float32) for bound in ends)
     name = data.env_spec.id if data.env_spec else data.spec.dataset_id
-    kept = None if spaces.plain else spaces
+    kept = spaces.unless_plain
     return Dataset(states, None, None, low, high, str(name), kept)
 
 

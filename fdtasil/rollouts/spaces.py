@@ -312,6 +312,11 @@ class Spaces:
         """Whether both are their own flat forms."""
         return self.observations.plain and self.actions.plain
 
+    @property
+    def unless_plain(self) -> "Spaces | None":
+        """Return them where they say more than sizes, else None."""
+        return None if self.plain else self
+
     @classmethod
     def of(cls, source: Any) -> "Spaces":
         """Read the spaces of an environment, a vector of them, or a dataset.

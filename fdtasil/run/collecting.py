@@ -85,7 +85,7 @@ class Collecting:
         counts["terminated_episodes"] += int(episodes.terminated.sum())
         counts["replaced_episodes"] += replaced
         counts["given_up_episodes"] += int(episodes.given_up.sum())
-        spaces = None if self.pool.spaces.plain else self.pool.spaces
+        spaces = self.pool.spaces.unless_plain
         about = self.pool.name, spaces, self.history, self.remembered
         dataset = Dataset(states, None, None, boxes.low, boxes.high, *about)
         return Collected(dataset, first + len(episodes.valid), counts)

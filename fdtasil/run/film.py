@@ -16,13 +16,14 @@ from PIL import Image, ImageDraw, ImageFont
 from fdtasil.checks import check_count, check_path
 from fdtasil.errors import EnvironmentFault, ExportError, SettingError, first_line
 from fdtasil.experts.carrying import carry
-from fdtasil.experts.expert import Expert, Hints
-from fdtasil.experts.load import ExpertLike, open_expert, sized
-from fdtasil.experts.structure import in_spaces
+from fdtasil.experts.load import ExpertLike, sized
+from fdtasil.experts.onnx_expert import said_history
 from fdtasil.files.storage import write_bytes
 from fdtasil.progress import Progress
 from fdtasil.rollouts.environments import EnvironmentLike, EnvironmentPool, resolve_horizon
+from fdtasil.rollouts.history import WithHistory
 from fdtasil.rollouts.wanted import Environment
+from fdtasil.run.judging import judged_in
 from fdtasil.student.view import View
 
 __all__ = ["choose_renderer", "render"]
@@ -211,13 +212,15 @@ def _drawing(env: EnvironmentLike) -> EnvironmentLike:
 
 def _acting(policy: ExpertLike, pool: EnvironmentPool) -> Callable[[np.ndarray], np.ndarray]:
     """Return what answers the environment's flat observations."""
+    history, layout = said_history(policy), pool.spaces.actions
+    if history > 1:
+        pool.wrap(lambda made: WithHistory(made, history, layout))
     n, m = pool.boxes.observation_size, pool.boxes.action_size
-    spaces = None if pool.spaces.plain else pool.spaces
-    opened: Expert = open_expert(policy, Hints(n, m, spaces=spaces))
-    if opened.columns is not None:
-        view = View.of(opened.columns, np.zeros((1, n), np.float32))
-        return view.policy(sized(opened, view.size, m).policy("evaluate"))
-    opened, _, _ = carry(sized(in_spaces(opened, spaces), n, m), pool)
+    judged = judged_in(policy, pool, n, whole=history == 1)
+    if judged.columns is not None:
+        view = View.of(judged.columns, np.zeros((1, n), np.float32))
+        return view.policy(sized(judged, view.size, m).policy("evaluate"))
+    opened, _, _ = carry(sized(judged, n, m), pool)
     return opened.policy("evaluate")
 
 

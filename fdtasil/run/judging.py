@@ -13,7 +13,7 @@ def judged_in(
     policy: ExpertLike, pool: EnvironmentPool, size: int | None, *, whole: bool
 ) -> Expert:
     """Open a policy that is judged; one that sees a part of the observation takes flat rows."""
-    spaces = None if pool.spaces.plain else pool.spaces
+    spaces = pool.spaces.unless_plain
     judged = open_expert(policy, Hints(size, pool.boxes.action_size, spaces=spaces))
     if spaces is not None and (not whole or judged.columns is not None):
         spaces = Spaces(flat_layout(size or 1), spaces.actions)

@@ -80,7 +80,7 @@ def open_subject(
     with EnvironmentPool(env) if env is not None else nullcontext() as pool:
         if pool is not None:
             n, m, name = pool.boxes.observation_size, pool.boxes.action_size, pool.name
-            spaces = None if pool.spaces.plain else pool.spaces
+            spaces = pool.spaces.unless_plain
         else:
             assert given is not None
             n, m = given.own_size, given.sizes[1]
