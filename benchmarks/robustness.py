@@ -1,6 +1,6 @@
 """What happens to a student where the machine is not the simulator: noise, pushes, mass, grip."""
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -56,7 +56,7 @@ def run(cell: Cell, device: str) -> dict[str, Any]:
 
 
 def compare_under_disturbances(
-    expert: str, seed: int, settings: Mapping[str, Any]
+    expert: str, seed: int, settings: Mapping[str, Any], disturbed: Iterable[str] = DISTURBANCES
 ) -> dict[str, Any]:
     """Distil once, and return what student and expert reach under each disturbance.
 
@@ -64,6 +64,7 @@ def compare_under_disturbances(
         expert: A name of `CONTROLLERS`.
         seed: Of the distillation, the starts and the disturbances.
         settings: Further arguments of `distill`, as `call_of` takes them.
+        disturbed: Names of the disturbances.
     """
     path, environment = CONTROLLERS[expert].open()
     result = fdtasil.distill(
@@ -78,8 +79,8 @@ def compare_under_disturbances(
     )
     deviations = result.dataset.demonstrations.observations.std(axis=0, dtype=np.float64)
     found: dict[str, Any] = {}
-    for name, disturbance in DISTURBANCES.items():
-        make = partial(_make, disturbance, environment, deviations)
+    for name in disturbed:
+        make = partial(_make, DISTURBANCES[name], environment, deviations)
         try:
             evaluation = fdtasil.evaluate(
                 result.student,

@@ -1,0 +1,95 @@
+"""Other masses than the demonstrations': what `spread=` does for a robot that observes its own."""
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+import fdtasil
+from benchmarks.controllers import CONTROLLERS, available
+from benchmarks.grid import SEEDS
+from benchmarks.robustness import compare_under_disturbances
+from benchmarks.runner import Benchmark, Cell, Row
+from benchmarks.statistics import difference_text, interval_text, paired_difference
+from benchmarks.tables import table
+
+__all__ = ["BENCHMARK"]
+
+EXPERTS = ("paper/Humanoid", "Humanoid-v5")
+FRESH, SPREAD = "fresh", "fresh, masses spread"
+METHODS = ("plain cloning", FRESH, SPREAD)
+DISTURBED = ("none", "mass x 0.8", "mass x 1.2")
+SHARE = 0.1  # of a mass, the deviation that it will have
+# Ten numbers of inertia for each body, the last its mass, behind 22 positions and 23 speeds.
+_FIRST, _EACH, _MASS = 45, 10, 9
+_BODIES = {"paper/Humanoid": 14, "Humanoid-v5": 13}
+
+
+def cells(quick: bool) -> list[Cell]:
+    """Every expert, seed and method."""
+    return [
+        {"expert": expert, "method": method, "seed": seed}
+        for seed in (SEEDS[:2] if quick else SEEDS)
+        for expert in available(*EXPERTS)
+        for method in METHODS
+    ]
+
+
+def run(cell: Cell, device: str) -> dict[str, Any]:
+    """Distil with the usual masses, and compare with the expert on others."""
+    settings: dict[str, Any] = {"probes": 0 if cell["method"] == METHODS[0] else "fresh"}
+    if cell["method"] == SPREAD:
+        settings["spread"] = _masses(cell["expert"])
+    found = compare_under_disturbances(
+        cell["expert"], cell["seed"], {**settings, "device": device}, DISTURBED
+    )
+    return {name: found[name] for name in DISTURBED}
+
+
+def _masses(expert: str) -> dict[int, float]:
+    """Return the coordinates of the bodies' masses, and how far each will go."""
+    path, env = CONTROLLERS[expert].open()
+    recorded = fdtasil.distill(
+        path,
+        env,
+        0,
+        episodes=1,
+        horizon=2,
+        fit=fdtasil.Fit(steps=1),
+        evaluation_episodes=0,
+        progress=False,
+    )
+    first = recorded.demonstrations.observations[0]
+    places = [_FIRST + _EACH * body + _MASS for body in range(_BODIES[expert])]
+    return {place: SHARE * float(first[place]) for place in places if first[place] > 0}
+
+
+def draw(rows: Sequence[Row]) -> dict[str, bytes]:
+    """One table: experts and masses down, methods across."""
+    lines = []
+    for expert in dict.fromkeys(row["cell"]["expert"] for row in rows):
+        for name in DISTURBED:
+            shares = _shares(rows, expert, name)
+            theirs = list(shares.pop("expert").values())
+            if any(len(found) < 2 for found in shares.values()):
+                continue
+            texts = [interval_text(list(found.values())) for found in shares.values()]
+            gain = difference_text(*paired_difference(shares[SPREAD], shares[FRESH]))
+            lines.append([expert, name, f"{np.mean(theirs):.2f}", *texts, gain])
+    heads = ["expert", "physics", "the expert", *METHODS, f"{SPREAD} - {FRESH}"]
+    return {"masses.md": table(heads, lines).encode()}
+
+
+def _shares(rows: Sequence[Row], expert: str, name: str) -> dict[str, dict[int, float]]:
+    """Return column -> seed -> share of the undisturbed expert's return."""
+    shares: dict[str, dict[int, float]] = {column: {} for column in ("expert", *METHODS)}
+    for row in rows:
+        cell, result = row["cell"], row["result"]
+        if cell["expert"] == expert:
+            whole = result["none"]["expert_return"]
+            shares[cell["method"]][cell["seed"]] = result[name]["student_return"] / whole
+            shares["expert"][cell["seed"]] = result[name]["expert_return"] / whole
+    return shares
+
+
+BENCHMARK = Benchmark("masses", __doc__ or "", cells, run, draw)
