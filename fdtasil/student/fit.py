@@ -34,8 +34,9 @@ class Fit:
     """How a student is optimised: length, AdamW, the terms of the Taylor loss, validation.
 
     Attributes:
-        steps: Gradient steps of a round. Left out, 4,000, or 12,000 where the expert is asked
-            anew; beyond 1,500 states, or 13,500, more by the square root of their number.
+        steps: Gradient steps of a round. Left out, 4,000 where answers are stored, and 12,000
+            where the expert is asked anew. Above 1,500 states, or 13,500 where it is asked anew,
+            they grow with the square root of the number of states.
         epochs: Visits of each state in a round, instead of steps.
         batch_size: States in a minibatch at most; an epoch's are of almost equal size.
         learning_rate: Peak learning rate of AdamW, with cosine decay to zero. Left out, 0.001, or
