@@ -60,7 +60,7 @@ check: lint types docs wheel test
 
 # The documentation as pages; a warning is an error.
 docs: .venv/ready
-	$(BIN)/sphinx-build -q -W --keep-going docs docs/_build
+	$(BIN)/sphinx-build -q -W --keep-going docs docs/_build/html
 
 clean:
 	rm -rf .venv docs/_build .wheel build dist
