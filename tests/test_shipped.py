@@ -148,6 +148,12 @@ def test_what_is_not_the_expert_is_not_written(inside, served, tmp_path):
         assert not (tmp_path / "new").exists()
 
 
+def test_who_has_no_expert_is_told_of_those_that_come_along(inside, tmp_path):
+    missing = inside("inspect", f"experts/{SMALL}.onnx", SMALL, cwd=tmp_path)
+    assert missing.returncode == 1
+    assert "`fdtasil experts`" in missing.stderr
+
+
 @pytest.mark.parametrize(
     ("said", "hint"),
     [(["fetch"], "fetch NAME"), (["fetch", "Walker2d"], "Walker2d-v5"), (["list", OTHER], OTHER)],
