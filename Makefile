@@ -4,7 +4,7 @@ BIN = .venv/bin
 # One thread per process: several at once on few cores are many times slower otherwise.
 export OMP_NUM_THREADS = 1
 
-.PHONY: demo docs film test torture lint types wheel check clean
+.PHONY: demo docs film test torture lint types wheel dist check clean
 
 demo: .venv/ready
 	$(BIN)/fdtasil distill experts/HalfCheetah-v5.onnx HalfCheetah-v5 \
@@ -34,14 +34,20 @@ lint: .venv/ready
 types: .venv/ready
 	$(BIN)/pyright
 
-# A wheel, installed into an empty environment, from which an empty folder is worked in.
-wheel: .venv/ready
-	rm -rf dist .wheel
-	$(BIN)/pip wheel --quiet --disable-pip-version-check --no-deps --wheel-dir dist .
-	$(PYTHON) -m venv .wheel
-	.wheel/bin/pip install --quiet --disable-pip-version-check -c constraints.txt torch
-	.wheel/bin/pip install --quiet --disable-pip-version-check -c constraints.txt dist/*.whl
-	cd .wheel && bin/python -P ../tests/wheel_run.py
+# An sdist and the wheel of it, installed into an empty environment and used from an empty folder:
+# `make wheel` by one Python, `make dist` by each that is there.
+wheel: PYTHONS = $(PYTHON)
+dist: PYTHONS = python3.11 python3.12 python3.13 python3.14
+wheel dist: .venv/ready
+	rm -rf dist
+	$(BIN)/python -m build --quiet
+	@set -e; for python in $(PYTHONS); do \
+		if ! $$python --version >/dev/null 2>&1; then echo "skipped: no $$python"; continue; fi; \
+		rm -rf .wheel; $$python -m venv .wheel; \
+		.wheel/bin/pip install --quiet --disable-pip-version-check -c constraints.txt torch; \
+		.wheel/bin/pip install --quiet --disable-pip-version-check -c constraints.txt dist/*.whl; \
+		(cd .wheel && bin/python -P ../tests/wheel_run.py); \
+	done
 
 check: lint types docs wheel test
 
@@ -54,7 +60,7 @@ check: lint types docs wheel test
 
 # The documentation as pages; a warning is an error.
 docs: .venv/ready
-	$(BIN)/sphinx-build -q -W --keep-going docs docs/_build
+	$(BIN)/sphinx-build -q -W --keep-going docs docs/_build/html
 
 clean:
 	rm -rf .venv docs/_build .wheel build dist

@@ -1,5 +1,6 @@
-"""Progress bars with the time left; silent where there is no terminal."""
+"""Progress bars with the time left; silent where there is neither a terminal nor a notebook."""
 
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
@@ -37,7 +38,7 @@ class Progress:
 
     def __init__(self, shown: bool) -> None:
         # None lets tqdm look whether there is a terminal.
-        self._disable = None if shown else True
+        self._disable = (False if _in_a_notebook() else None) if shown else True
 
     @contextmanager
     def bar(self, title: str, unit: str, total: int | None = None) -> Iterator[Bar]:
@@ -46,3 +47,9 @@ class Progress:
             total=total, desc=f"{title:24}", unit=unit, disable=self._disable, leave=False
         ) as bar:
             yield Bar(bar)
+
+
+def _in_a_notebook() -> bool:
+    """Whether a Jupyter kernel runs this: its stderr is no terminal, but somebody looks at it."""
+    ipython = sys.modules.get("IPython")  # a kernel has it loaded
+    return ipython is not None and hasattr(ipython.get_ipython(), "kernel")

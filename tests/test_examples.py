@@ -1,5 +1,6 @@
 """The examples do what they say."""
 
+import json
 import runpy
 import sys
 from importlib import import_module
@@ -31,6 +32,12 @@ def test_every_script_runs(script, tmp_path, monkeypatch, capsys):
         (tmp_path / "examples" / f"{script}.py").write_text(source)
         runpy.run_path(str(tmp_path / "examples" / f"{script}.py"), run_name="__main__")
     assert capsys.readouterr().out.strip()
+
+
+def test_the_notebook_holds_no_outputs():
+    """They would be of another version; `make docs` runs it anew."""
+    cells = json.loads((EXAMPLES / "notebook.ipynb").read_text())["cells"]
+    assert not any(cell.get("outputs") or cell.get("execution_count") for cell in cells)
 
 
 @pytest.fixture

@@ -1,19 +1,24 @@
-"""Run what a wheel has installed, in a folder that holds nothing: `make wheel`."""
+"""Use what a wheel has installed as who has nothing else does: `make wheel`, `make dist`."""
 
+import json
+import platform
 import subprocess
 import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
-import numpy as np
-
 import fdtasil
 
+SHIPPED = "InvertedDoublePendulum-v5"
 
-def swing(observations):
-    """Hold a pendulum up, by angle and speed: (B, 3) -> (B, 1)."""
-    cosine, sine, speed = observations.T
-    return np.clip(-8 * np.arctan2(sine, cosine) - 2 * speed, -2, 2)[:, None]
+
+def fdtasil_says(*arguments: str, folder: str) -> str:
+    """Run the command line in a folder that holds nothing but what it wrote itself."""
+    line = [str(Path(sys.executable).with_name("fdtasil")), *arguments]
+    done = subprocess.run(line, capture_output=True, text=True, cwd=folder)
+    if done.returncode != 0:
+        raise SystemExit(f"fdtasil {' '.join(arguments)} failed:\n{done.stdout}{done.stderr}")
+    return done.stdout
 
 
 def main() -> None:
@@ -22,31 +27,31 @@ def main() -> None:
         raise SystemExit(f"{installed} is no installed wheel")
     if not installed.with_name("py.typed").exists():
         raise SystemExit("py.typed is missing from the wheel")
-    shown = subprocess.run(
-        [Path(sys.executable).with_name("fdtasil"), "--version"], capture_output=True, text=True
-    )
-    if shown.stdout.split() != ["fdtasil", fdtasil.__version__]:
-        raise SystemExit(f"fdtasil --version prints {shown.stdout + shown.stderr!r}")
+    short = ("--episodes", "1", "--horizon", "50", "--evaluation-episodes", "2")
+    short += ("--hidden", "16", "--steps", "200", "--out", "run")
     with TemporaryDirectory() as folder:
-        result = fdtasil.distill(
-            swing,
-            "Pendulum-v1",
-            probes=4,
+        version = fdtasil_says("--version", folder=folder)
+        if version.split() != ["fdtasil", fdtasil.__version__]:
+            raise SystemExit(f"fdtasil --version prints {version!r}")
+        if "experts" not in fdtasil_says("--help", folder=folder):
+            raise SystemExit("fdtasil --help does not name its commands")
+        fdtasil_says("experts", "fetch", SHIPPED, folder=folder)
+        fdtasil_says("distill", f"{SHIPPED}.onnx", SHIPPED, *short, folder=folder)
+        report = json.loads((Path(folder) / "run" / "report.json").read_bytes())
+        if report["queries"]["probe"] == 0:
+            raise SystemExit("the run has queried no probes")
+        told = report["evaluation"]["student_returns"]
+        judged = fdtasil.evaluate(
+            Path(folder) / "run" / "student.onnx",
+            Path(folder) / f"{SHIPPED}.onnx",
+            SHIPPED,
             episodes=2,
             horizon=50,
-            evaluation_episodes=2,
-            student=fdtasil.Mlp(16),
-            fit=fdtasil.Fit(steps=100),
-            out=Path(folder) / "run",
         )
-        judged = fdtasil.evaluate(
-            Path(folder) / "run" / "student.onnx", swing, "Pendulum-v1", episodes=2, horizon=50
-        )
-        if judged.student_returns != result.evaluation.student_returns:
-            apart = zip(judged.student_returns, result.evaluation.student_returns, strict=True)
-            if max(abs(a - b) for a, b in apart) > 1e-3:
-                raise SystemExit("the student's ONNX file acts otherwise than the student")
-    print(f"fdtasil {fdtasil.__version__} from {installed.parent}: distilled, saved, evaluated")
+        if max(abs(a - b) for a, b in zip(judged.student_returns, told, strict=True)) > 1e-3:
+            raise SystemExit("the student's ONNX file acts otherwise than the student")
+    python = platform.python_version()
+    print(f"Python {python}: fdtasil {fdtasil.__version__} fetched, distilled, saved, evaluated")
 
 
 if __name__ == "__main__":

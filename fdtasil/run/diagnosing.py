@@ -114,7 +114,7 @@ def diagnose(
         steps: From the start of each episode, how many steps are disturbed and followed. Legged
             robots are chaotic: after a few dozen the smallest disturbance has led elsewhere.
         seed: Of starts and directions.
-        progress: Show progress bars, where there is a terminal.
+        progress: Show progress bars, in a terminal or a notebook.
 
     Raises:
         SettingError: If actions are choices, which nothing is between.

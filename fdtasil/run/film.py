@@ -56,7 +56,7 @@ def render(
         horizon: Steps after which the episode is cut; default: the environment's time limit.
         every: Steps between two pictures; the film keeps the environment's pace.
         height: Of a picture, in pixels.
-        progress: Show progress bars, where there is a terminal.
+        progress: Show progress bars, in a terminal or a notebook.
 
     Raises:
         SettingError: If an argument can't be used.

@@ -149,7 +149,7 @@ def distill(
             differ.
         callback: Told of each 100 training steps, each round and the evaluation; see `Event`. One
             or several, such as `fdtasil.Log("runs/walker/log", "csv")`.
-        progress: Show progress bars, where there is a terminal.
+        progress: Show progress bars, in a terminal or a notebook.
 
     Returns:
         The student with its evaluation, history, queries and settings.
@@ -253,7 +253,7 @@ def evaluate(
         history: As in `distill`.
         constraints: As in `distill`.
         force: Go on with a warning where the expert fails the gate but answers.
-        progress: Show progress bars, where there is a terminal.
+        progress: Show progress bars, in a terminal or a notebook.
 
     Raises:
         SettingError: If an argument can't be used.

@@ -170,7 +170,7 @@ def shrink(
             are, so that it may be killed and begun again.
         workers: Students that are trained side by side, in processes; the expert must be a path
             or an address then, and the environment an id.
-        progress: Show a progress bar, where there is a terminal.
+        progress: Show a progress bar, in a terminal or a notebook.
 
     Raises:
         SettingError: If an argument can't be used.

@@ -77,7 +77,7 @@ def distil(arguments: Arguments, *, progress: bool = True) -> Distilled:
 
     Args:
         arguments: By name; None where one was left out.
-        progress: Show progress bars, where there is a terminal.
+        progress: Show progress bars, in a terminal or a notebook.
 
     Raises:
         FdtasilError: As `distill`.

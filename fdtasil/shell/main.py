@@ -14,6 +14,7 @@ from fdtasil.version import __version__
 __all__ = ["COMMANDS", "main"]
 
 COMMANDS = {
+    "experts": "those that come with the library, and their files",
     "inspect": "what an expert is: its contract with the environment, and its return",
     "distill": "an expert into a small torch policy that reacts as it does",
     "evaluate": "a policy beside an expert, from the same starts",

@@ -115,5 +115,6 @@ def _read_bytes(path: Path) -> bytes:
             "name the file itself",
         )
     beside = [p.name for p in (path.with_name(f"{path.name}{end}") for end in _ENDS) if p.exists()]
-    hint = f"name it whole: {beside[0]}" if beside else "check the path"
+    shipped = "check the path; `fdtasil experts` lists the shipped ones, and fetches them"
+    hint = f"name it whole: {beside[0]}" if beside else shipped
     return read_limited(path, _SIZE_LIMIT, "an ONNX file", hint)
