@@ -28,6 +28,7 @@ __all__ = [
     "evaluate_pair",
     "evaluation_rows",
     "interval_text",
+    "rows_html",
     "score_text",
 ]
 
@@ -108,11 +109,7 @@ class Evaluation:
         return from_plain(cls, fields)
 
     def _repr_html_(self) -> str:
-        lines = "".join(
-            f"<tr><td>{escape(name)}</td><td>{escape(text)}</td></tr>"
-            for name, text in evaluation_rows(self)
-        )
-        return f"<table>{lines}</table>"
+        return rows_html(evaluation_rows(self))
 
     def __str__(self) -> str:
         expert = f"{self.expert_return:10.1f}   survival {self.expert_survival:.2f}"
@@ -139,6 +136,15 @@ class Evaluation:
             return ""
         told = f"{self.roughness:10.3f}   expert {self.expert_roughness:.3f}, change in a step"
         return f"\n  roughness         {told}"
+
+
+def rows_html(rows: Sequence[tuple[str, str]]) -> str:
+    """Return names and texts as a table of HTML."""
+    apart = 'style="padding-right: 1em"'
+    lines = "".join(
+        f"<tr><td {apart}>{escape(name)}</td><td>{escape(text)}</td></tr>" for name, text in rows
+    )
+    return f"<table>{lines}</table>"
 
 
 def evaluation_rows(found: Evaluation) -> list[tuple[str, str]]:

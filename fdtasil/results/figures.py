@@ -106,7 +106,7 @@ def draw_returns(evaluation: Evaluation) -> bytes:
     panel.set_xlabel("evaluation episode, in the order of the expert's return")
     panel.set_ylabel(f"return over {evaluation.horizon} steps")
     if min(*expert, *student) > 0:
-        panel.set_ylim(bottom=0)
+        panel.set_ylim(0, 1.08 * max(*expert, *student))  # whole marks, where all are equal
     panel.grid(alpha=0.3, axis="y", linewidth=0.5)
     # Outside: between the axes its marks would read as two episodes.
     panel.legend(frameon=False, fontsize=8, loc="upper left", bbox_to_anchor=(1, 1))

@@ -2,11 +2,11 @@
 
 import base64
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from html import escape
 from typing import Any
 
-from fdtasil.results.evaluation import Evaluation, evaluation_rows
+from fdtasil.results.evaluation import Evaluation, evaluation_rows, rows_html
 from fdtasil.results.figures import FIGURES
 from fdtasil.results.summary import call_of, run_rows
 
@@ -39,8 +39,10 @@ def page_of(result: Any) -> str:
         f"<h1>{escape(report['env'])}</h1>",
         _headline(evaluation),
         f"<h2>Warnings</h2>{warnings}" if warnings else "",
-        "" if evaluation is None else f"<h2>Evaluation</h2>{_table(evaluation_rows(evaluation))}",
-        f"<h2>How it came to be</h2>{_table(run_rows(report))}",
+        ""
+        if evaluation is None
+        else f"<h2>Evaluation</h2>{rows_html(evaluation_rows(evaluation))}",
+        f"<h2>How it came to be</h2>{rows_html(run_rows(report))}",
         *(f"<h2>{name.capitalize()}</h2>{picture}" for name, picture in _pictures(result)),
         f"<h2>Again</h2><pre>{escape(call_of(result.settings))}</pre>",
         f"<h2>Settings</h2><pre>{escape(json.dumps(result.settings, indent=1))}</pre>",
@@ -58,9 +60,9 @@ def page_of(result: Any) -> str:
 def result_html(result: Any) -> str:
     """Return what a notebook shows of a result: two tables and the returns."""
     evaluation = result.evaluation
-    judged = "" if evaluation is None else _table(evaluation_rows(evaluation))
+    judged = "" if evaluation is None else rows_html(evaluation_rows(evaluation))
     pictures = [picture for name, picture in _pictures(result) if name == "returns"]
-    return "".join([judged, _table(run_rows(result.report)), *pictures])
+    return "".join([judged, rows_html(run_rows(result.report)), *pictures])
 
 
 def _headline(evaluation: Evaluation | None) -> str:
@@ -68,11 +70,6 @@ def _headline(evaluation: Evaluation | None) -> str:
         return "<p>It was not compared with its expert.</p>"
     share = f"{evaluation.normalized_return:.0%}"
     return f'<p><span class="big">{share}</span> of the expert\'s return</p>'
-
-
-def _table(rows: Sequence[tuple[str, str]]) -> str:
-    lines = "".join(f"<tr><td>{escape(n)}</td><td>{escape(t)}</td></tr>" for n, t in rows)
-    return f"<table>{lines}</table>"
 
 
 def _pictures(result: Any) -> list[tuple[str, str]]:
