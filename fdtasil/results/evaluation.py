@@ -1,6 +1,6 @@
 """Paired evaluation: student and expert from the same starts, with an interval."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from typing import Any
