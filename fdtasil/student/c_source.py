@@ -124,15 +124,23 @@ _BEND_TEXT = """static void bend(float *values, int count)
     }}
 }}
 """
+# Four sums side by side: a processor need not wait for one before it adds the next.
 _LINEAR = """static void linear(const float *weights, const float *biases, const float *input,
                    float *output, int inputs, int outputs)
 {
     int i, j;
     for (i = 0; i < outputs; i++) {
-        float sum = biases[i];
-        for (j = 0; j < inputs; j++)
-            sum += weights[i * inputs + j] * input[j];
-        output[i] = sum;
+        const float *row = weights + i * inputs;
+        float a = biases[i], b = 0.0f, c = 0.0f, d = 0.0f;
+        for (j = 0; j + 3 < inputs; j += 4) {
+            a += row[j] * input[j];
+            b += row[j + 1] * input[j + 1];
+            c += row[j + 2] * input[j + 2];
+            d += row[j + 3] * input[j + 3];
+        }
+        for (; j < inputs; j++)
+            a += row[j] * input[j];
+        output[i] = (a + b) + (c + d);
     }
 }
 """
