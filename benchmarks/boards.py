@@ -3,7 +3,7 @@
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from copy import deepcopy
 from functools import cache
 from pathlib import Path
@@ -33,6 +33,7 @@ STUDENTS: dict[str, Any] = {
     "512 x 512, gelu": fdtasil.Mlp((512, 512)),
 }
 HERE = "x86-64"
+OWN = {"fdtasil": "student.c", "fdtasil, int8": "student.int8.c"}
 OTHER = "emx-onnx-cgen"
 STATES = 10_000  # real ones, and as many from a normal distribution of deviation 10
 ON_BOARD = 100
@@ -44,14 +45,17 @@ def cells(quick: bool) -> list[Cell]:
     """Every student on every board, and the smallest as another generator writes it."""
     students = list(STUDENTS)[:1] if quick else list(STUDENTS)
     machines = [*BOARDS, HERE]
-    own = [{"student": s, "code": "fdtasil", "machine": m} for s in students for m in machines]
+    own = [
+        {"student": s, "code": c, "machine": m} for s in students for c in OWN for m in machines
+    ]
     return own + [{"student": students[0], "code": OTHER, "machine": m} for m in machines]
 
 
 def measure(cell: Cell, device: str) -> dict[str, Any]:
     """Measure one cell; where, it says itself."""
     result, states = _student(cell["student"]), _states()
-    source = _CODES[cell["code"]](result)
+    code = cell["code"]
+    source = _others(result) if code == OTHER else result.export_bytes(OWN[code]).decode()
     header = result.export_bytes("student.h").decode()
     if cell["machine"] == HERE:
         answers = answers_of(source + _MAIN, "STUDENT_LINES", states)
@@ -97,10 +101,6 @@ def _states() -> np.ndarray:
     return np.concatenate([real[:STATES], far]).astype(np.float32)
 
 
-def _own(result: Distilled) -> str:
-    return result.export_bytes("student.c").decode()
-
-
 def _others(result: Distilled) -> str:
     """Return the C that another generator makes of the ONNX file, all of it on the stack."""
     tool = shutil.which(OTHER) or shutil.which(OTHER, path=str(Path(sys.executable).parent))
@@ -116,7 +116,6 @@ def _others(result: Distilled) -> str:
     return f"{written}\n{header}\n{_WRAPPED}"
 
 
-_CODES: dict[str, Callable[[Distilled], str]] = {"fdtasil": _own, OTHER: _others}
 _WRAPPED = """void student(const float observation[STUDENT_OBSERVATIONS],
              float action[STUDENT_ACTIONS])
 {
