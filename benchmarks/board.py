@@ -36,14 +36,17 @@ class Board:
     ram: int
 
 
+_HARD = "-mfloat-abi=hard"
 BOARDS = {
+    "Cortex-M3": Board("mps2-an385", ("-mcpu=cortex-m3",), 0x00000000, 0x20000000),
     "Cortex-M4F": Board(
-        "mps2-an386", ("-mcpu=cortex-m4", "-mfpu=fpv4-sp-d16"), 0x00000000, 0x20000000
+        "mps2-an386", ("-mcpu=cortex-m4", "-mfpu=fpv4-sp-d16", _HARD), 0x00000000, 0x20000000
     ),
     "Cortex-M33": Board(
-        "mps2-an505", ("-mcpu=cortex-m33", "-mfpu=fpv5-sp-d16"), 0x10000000, 0x38000000
+        "mps2-an505", ("-mcpu=cortex-m33", "-mfpu=fpv5-sp-d16", _HARD), 0x10000000, 0x38000000
     ),
 }
+"""By their processors; the first has no unit for floating-point numbers."""
 
 
 @dataclass(frozen=True)
@@ -110,7 +113,7 @@ def _linked(board: Board, folder: Path, *flags: str) -> Path:
     layout = {"FLASH": board.flash, "RAM": board.ram, "RAM_SIZE": 2**21}
     _run(
         [
-            *("arm-none-eabi-gcc", "-std=gnu99", "-O2", "-mthumb", "-mfloat-abi=hard"),
+            *("arm-none-eabi-gcc", "-std=gnu99", "-O2", "-mthumb"),
             *(
                 *board.flags,
                 "-ffunction-sections",
