@@ -78,13 +78,17 @@ static __attribute__((noinline)) uint32_t stack_of_one(void)
 
 int main(void)
 {
-    uint32_t i, j, taken;
+    uint32_t i, j, last, now, taken = 0;
     say(CALIBRATION, ' ');
     say(calibrated(), ' ');
     start_clock();
-    for (i = 0; i < STATES; i++)
+    last = ticks();
+    for (i = 0; i < STATES; i++) {
         ASK(states[i], actions[i]);
-    taken = ticks();
+        now = ticks();
+        taken += (now - last) & 0xFFFFFF; /* one answer takes less than a turn of the clock */
+        last = now;
+    }
     say(taken, ' ');
     say(stack_of_one(), '\n');
     for (i = 0; i < STATES; i++)
