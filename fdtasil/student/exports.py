@@ -16,6 +16,7 @@ from fdtasil.student.int8 import as_int8, check_change
 from fdtasil.student.own_form import check_own_form, own_form
 from fdtasil.student.plain import PlainPolicy
 from fdtasil.student.policy import Student
+from fdtasil.student.tflite import tflite_model
 
 __all__ = ["EXPORTS", "export"]
 
@@ -79,6 +80,10 @@ def _int8_c(student: Student, states: np.ndarray, metadata: Mapping[str, str]) -
     return source.encode()
 
 
+def _tflite(student: Student, states: np.ndarray, metadata: Mapping[str, str]) -> bytes:
+    return tflite_model(_plain(student), states, metadata)
+
+
 def _h(student: Student, states: np.ndarray, metadata: Mapping[str, str]) -> bytes:
     return c_header(_plain(student)).encode()
 
@@ -92,6 +97,7 @@ EXPORTS: dict[str, Writer] = {
     ".int8.onnx": _int8,
     ".onnx": _onnx,
     ".safetensors": _safetensors,
+    ".tflite": _tflite,
     ".int8.c": _int8_c,
     ".c": _c,
     ".h": _h,
