@@ -77,6 +77,7 @@ def _written(graph: "_Graph", policy: PlainPolicy, about: Mapping[str, str]) -> 
         value = squashed
     value = graph.apply("MUL", [value, graph.constant("half", policy.half)])
     value = graph.apply("ADD", [value, graph.constant("centre", policy.centre)])
+    graph.rename(value, "scores" if policy.choices else "actions")
     return graph.model(given, value, json.dumps(dict(about)))
 
 
@@ -130,9 +131,11 @@ class _Graph:
         self._operators.append(operator)
         return made
 
+    def rename(self, number: int, name: str) -> None:
+        self._tensors[number].name = name
+
     def model(self, given: int, made: int, description: str) -> bytes:
         schema = self._schema
-        self._tensors[made].name = "actions"
         part, model = schema.SubGraphT(), schema.ModelT()
         part.tensors, part.operators = self._tensors, self._operators
         part.inputs, part.outputs, part.name = [given], [made], "policy"
