@@ -1,5 +1,6 @@
-"""A hub on this machine: as much of the Hugging Face hub as fetching a file takes."""
+"""A hub on this machine: as much of the Hugging Face hub as fetching and sending files takes."""
 
+import base64
 import hashlib
 import json
 import threading
@@ -12,9 +13,13 @@ from urllib.parse import unquote, urlsplit
 
 @dataclass
 class Repository:
-    """Commits and the branches that name them; `access` is "public", "gated" or "private"."""
+    """Commits and the branches that name them; `access` is "public", "gated" or "private".
+
+    Who has the owner's token sees a private one, and may write.
+    """
 
     access: str = "public"
+    owner: str | None = None
     commits: dict[str, dict[str, bytes]] = field(default_factory=dict)
     branches: dict[str, str] = field(default_factory=dict)
 
@@ -48,11 +53,13 @@ class StandIn:
         silent: Paths that hold this text get no answer.
         broken: Paths that hold this text are answered with this status.
         spoilt: Whether something on the way replaces what files hold.
+        writers: Tokens that may make repositories.
     """
 
     def __init__(self):
         self.repositories, self.requests = {}, []
         self.large, self.silent, self.broken, self.spoilt = 10**6, None, (None, 0), False
+        self.writers: set[str] = set()
         self.closing = threading.Event()
         self._servers = [self._serve("hub"), self._serve("store")]
         self.endpoint, self.store = (f"http://127.0.0.1:{s.server_port}" for s in self._servers)
@@ -91,15 +98,10 @@ class Handler(BaseHTTPRequestHandler):
         self.do_GET()
 
     def do_GET(self):
-        hub, path = self.stand_in, urlsplit(self.path).path
-        token = self.headers.get("Authorization")
-        hub.requests.append(Request(self.name, unquote(path), token, time.monotonic()))
-        if hub.silent is not None and hub.silent in path:
-            hub.closing.wait(60)
-            self.close_connection = True
-        elif hub.broken[0] is not None and hub.broken[0] in path:
-            self._refuse(hub.broken[1])
-        elif self.name == "store":
+        path = urlsplit(self.path).path
+        if self._in_trouble(path):
+            return
+        if self.name == "store":
             self._send(200, self._stored(path.removeprefix("/")))
         elif path.startswith("/api/models/"):
             repo, _, revision = path.removeprefix("/api/models/").partition("/revision/")
@@ -108,6 +110,64 @@ class Handler(BaseHTTPRequestHandler):
             repo, _, rest = path.removeprefix("/").partition("/resolve/")
             revision, _, file = rest.partition("/")
             self._resolve(repo, unquote(revision), unquote(file))
+
+    def do_POST(self):
+        hub, path = self.stand_in, urlsplit(self.path).path
+        body = self.rfile.read(int(self.headers["Content-Length"]))
+        if self._in_trouble(path):
+            return
+        token = (self.headers.get("Authorization") or "").removeprefix("Bearer ")
+        if path == "/api/validate-yaml":
+            self._answer({"errors": [], "warnings": []})
+        elif path == "/api/repos/create":
+            asked = json.loads(body)
+            name = f"{asked['organization']}/{asked['name']}"
+            if token not in hub.writers:
+                self._refuse(403)
+                return
+            hidden = asked.get("visibility") == "private" or asked.get("private")
+            hub.repositories[name] = Repository("private" if hidden else "public", token)
+            self._answer({"url": f"{hub.endpoint}/{name}"})
+        else:
+            name, _, step = (
+                path.removeprefix("/api/models/").rpartition("/main")[0].rpartition("/")
+            )
+            if hub.repositories[name].owner != token:
+                self._refuse(403)
+                return
+            self._take(name, step, body)
+
+    def _take(self, name, step, body):
+        """Say that every file comes in the commit itself, or take that commit."""
+        if step == "preupload":
+            files = [file["path"] for file in json.loads(body)["files"]]
+            modes = {"uploadMode": "regular", "shouldIgnore": False}
+            self._answer({"files": [{"path": path, **modes} for path in files]})
+            return
+        lines = [json.loads(line) for line in body.splitlines()]
+        files = {
+            line["value"]["path"]: base64.b64decode(line["value"]["content"])
+            for line in lines
+            if line["key"] == "file"
+        }
+        sha = self.stand_in.repositories[name].commit(files)
+        self._answer({"commitUrl": f"{self.stand_in.endpoint}/{name}", "commitOid": sha})
+
+    def _in_trouble(self, path):
+        """Note a request, and whether nothing but trouble comes of it."""
+        hub, token = self.stand_in, self.headers.get("Authorization")
+        hub.requests.append(Request(self.name, unquote(path), token, time.monotonic()))
+        if hub.silent is not None and hub.silent in path:
+            hub.closing.wait(60)
+            self.close_connection = True
+            return True
+        if hub.broken[0] is not None and hub.broken[0] in path:
+            self._refuse(hub.broken[1])
+            return True
+        return False
+
+    def _answer(self, said):
+        self._send(200, json.dumps(said).encode())
 
     def _describe(self, name, revision):
         repository = self._open(name)
@@ -119,6 +179,7 @@ class Handler(BaseHTTPRequestHandler):
             return
         siblings = [self._sibling(*item) for item in sorted(repository.commits[sha].items())]
         answer = {"id": name, "modelId": name, "sha": sha, "siblings": siblings}
+        answer["private"] = repository.access == "private"
         self._send(200, json.dumps(answer).encode())
 
     def _sibling(self, name, data):
@@ -161,7 +222,10 @@ class Handler(BaseHTTPRequestHandler):
     def _open(self, name):
         """Return a repository that may be listed; who has no token learns no more than that."""
         repository = self.stand_in.repositories.get(name)
-        if repository is not None and repository.access != "private":
+        token = (self.headers.get("Authorization") or "").removeprefix("Bearer ")
+        if repository is not None and (
+            repository.access != "private" or repository.owner == token
+        ):
             return repository
         if self.headers.get("Authorization"):
             self._refuse(404, "RepoNotFound")
@@ -188,7 +252,7 @@ class Handler(BaseHTTPRequestHandler):
             self.send_header(name, value)
         self.send_header("Content-Length", str(len(data)))
         self.end_headers()
-        if self.command == "GET":
+        if self.command != "HEAD":
             self.wfile.write(data)
 
 

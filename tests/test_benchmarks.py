@@ -1,6 +1,7 @@
 """The runner of benchmarks: what is done is kept, what fails does not stop the rest."""
 
 import json
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -378,3 +379,36 @@ def test_no_mean_is_taken_of_what_is_no_number():
 
     with pytest.raises(ValueError, match="no number"):
         interval_text([0.5, None, 0.7])
+
+
+def test_a_board_without_its_tools_says_what_to_install(monkeypatch):
+    from benchmarks.board import BOARDS, on_board
+
+    monkeypatch.setenv("PATH", "")
+    with pytest.raises(RuntimeError, match="apt-get install gcc-arm-none-eabi libnewlib"):
+        on_board(BOARDS["Cortex-M4F"], "", "", np.zeros((1, 3), np.float32))
+
+
+@pytest.mark.parametrize("name", ["student.c", "student.int8.c"])
+@pytest.mark.parametrize("board", ["Cortex-M3", "Cortex-M4F", "Cortex-M33"])
+def test_a_simulated_board_answers_as_the_student(board, name):
+    from test_student import make
+
+    from benchmarks.board import BOARDS, on_board
+    from fdtasil.student.exports import export
+
+    for tool in ("arm-none-eabi-gcc", "qemu-system-arm"):
+        if shutil.which(tool) is None:
+            pytest.skip(f"needs {tool}")
+    rows = 5 + np.random.default_rng(0).standard_normal((10, 3)).astype(np.float32)
+    student = make((16, 16))
+    source, header = (export(student, rows, {}, file).decode() for file in (name, "student.h"))
+    found = on_board(BOARDS[board], source, header, rows)
+    assert found.answers == pytest.approx(
+        student.act(rows), abs=1e-5 if name == "student.c" else 0.1
+    )
+    products = 3 * 16 + 16 * 16 + 16 * 2
+    assert 2 * products < found.instructions < 400 * products
+    weights = products * (4 if name == "student.c" else 1)
+    assert weights < found.flash < weights + 8000
+    assert 0 < found.ram < 1000

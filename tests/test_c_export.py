@@ -13,6 +13,7 @@ import fdtasil
 from fdtasil.errors import ExpertError, ExportError, SettingError
 from fdtasil.files.compiled import compiler
 from fdtasil.student.architectures import ACTIVATIONS
+from fdtasil.student.c_int8 import rounded
 from fdtasil.student.c_source import c_source, check_parity
 from fdtasil.student.exports import export
 from fdtasil.student.plain import PLAIN
@@ -55,7 +56,7 @@ def test_compiled_it_answers_as_the_student(hidden, activation, tmp_path):
 @needs_a_compiler
 def test_a_sanitiser_finds_nothing_and_no_memory_is_asked_for(tmp_path):
     source = export(make((32, 32)), NEAR, {}, "student.c")
-    program = built(source, tmp_path, "-fsanitize=address,undefined", "-fno-sanitize-recover")
+    program = built(source, tmp_path, *SANITISERS)
     assert asked(program, FAR[:50]).shape == (50, 2)
     object_ = tmp_path / "student.o"
     file = tmp_path / "student.c"
@@ -65,6 +66,73 @@ def test_a_sanitiser_finds_nothing_and_no_memory_is_asked_for(tmp_path):
     assert undefined <= {"tanhf", "erff", "expm1f"}
     shown = {line.split()[-1] for line in symbols.splitlines() if " T " in line}
     assert shown == {"student"}
+
+
+SANITISERS = ("-fsanitize=address,undefined", "-fno-sanitize-recover")
+
+
+@needs_a_compiler
+@pytest.mark.parametrize("activation", ACTIVATIONS)
+@pytest.mark.parametrize("hidden", [(), (64, 64), (24, 7, 5)], ids=str)
+def test_in_eight_bits_it_answers_as_its_rounded_weights(hidden, activation, tmp_path):
+    student = make(hidden, activation)
+    source = export(student, NEAR, {"environment": "Toy-v0"}, "student.int8.c")
+    answers = asked(built(source, tmp_path, *SANITISERS), NEAR)
+    small = rounded(student.plain)
+    assert answers == pytest.approx(small(NEAR), abs=2e-3)
+    assert np.abs(answers - student.act(NEAR)).mean() < 0.05
+    assert np.abs(small(NEAR) - student.plain(NEAR)).max() > 1e-4
+    for (weights, _), (whole, _) in zip(small.layers, student.plain.layers, strict=True):
+        assert len(np.unique(weights[0])) <= 255
+        step = np.abs(whole).max(axis=1, keepdims=True) / 127
+        assert (np.abs(weights - whole) <= 0.51 * step).all()
+
+
+@needs_a_compiler
+def test_eight_bits_take_a_quarter_of_the_flash(tmp_path):
+    sizes = []
+    for name in ("student.int8.c", "student.c"):
+        file, object_ = tmp_path / "s.c", tmp_path / "s.o"
+        file.write_bytes(export(make((128, 128), "relu"), NEAR, {}, name))
+        subprocess.run([compiler(), "-std=c99", "-Os", "-c", "-o", object_, file], check=True)
+        sizes.append(object_.stat().st_size)
+    assert sizes[0] < 0.32 * sizes[1]
+
+
+@needs_a_compiler
+@pytest.mark.parametrize("width", [600, 3000])
+def test_a_sum_of_a_wide_layer_stays_within_32_bits(width, tmp_path):
+    """All weights and all inputs the largest that there are: what a sum can come to."""
+    student = make((width,), "relu", low=(-np.inf, -np.inf), high=(np.inf, np.inf))
+    with torch.no_grad():
+        for layer, value in ((student.network[0], 1.0), (student.network[2], 0.001)):
+            layer.weight.fill_(value)
+            layer.bias.zero_()
+    rows = NEAR[(NEAR - student.plain.mean).sum(axis=1) > 1]
+    source = export(student, rows, {}, "student.int8.c")
+    answers = asked(built(source, tmp_path, *SANITISERS), rows[:50])
+    assert answers == pytest.approx(student.act(rows[:50]), rel=1e-2)
+
+
+def test_a_student_that_eight_bits_change_is_refused():
+    student = make((8, 8), "relu", low=(-np.inf, -np.inf), high=(np.inf, np.inf))
+    with torch.no_grad():
+        student.network[4].weight.mul_(1000)  # of actions in units of 1
+    with pytest.raises(ExportError, match=r"in int8 the student's actions change by \d"):
+        export(student, FAR, {}, "student.int8.c")
+
+
+@needs_a_compiler
+@pytest.mark.parametrize("name", ["student.c", "student.int8.c"])
+@pytest.mark.parametrize("activation", ACTIVATIONS)
+def test_what_is_no_number_is_answered_with_none(activation, name, tmp_path):
+    """A sensor that fails must not look like one that works."""
+    program = built(export(make((16, 16), activation), NEAR, {}, name), tmp_path)
+    rows = NEAR[:3].copy()
+    rows[0, 1] = np.nan
+    answers = asked(program, rows)
+    assert np.isnan(answers[0]).all()
+    assert np.isfinite(answers[1:]).all()
 
 
 @needs_a_compiler
@@ -111,7 +179,7 @@ def test_weights_that_are_not_finite_are_refused():
         student.network[0].weight[0, 0] = torch.nan
     with pytest.raises(ExportError, match="not finite"):
         export(student, NEAR, {}, "student.c")
-    with pytest.raises(SettingError, match=r"\.onnx or \.safetensors or \.c or \.h"):
+    with pytest.raises(SettingError, match=r"\.onnx or \.safetensors or .*\.int8\.c or \.c or"):
         export(student, NEAR, {}, "student.exe")
 
 

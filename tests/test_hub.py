@@ -422,6 +422,118 @@ def test_a_shell_without_a_network_says_so_in_time(hub, tmp_path):
     assert len(hub.requests) == 1
 
 
+# --- a run that is handed on
+
+TOKEN = "hf_secret"
+CARD = ["README.md", "report.json", "student.onnx", "student.safetensors"]
+
+
+@pytest.fixture
+def writable(hub, surroundings):
+    """The hub, for somebody who may write."""
+    surroundings.setenv("HF_TOKEN", TOKEN)
+    hub.writers.add(TOKEN)
+    return hub
+
+
+def pushed(hub, name="me/toy"):
+    return hub.repositories[name].commits[newest(hub, name)]
+
+
+def test_a_run_is_pushed_without_its_demonstrations(writable, quick_folder, inside):
+    done = inside("push", quick_folder, "me/toy")
+    assert done.returncode == 0, done.stderr
+    files = pushed(writable)
+    assert sorted(name for name in files if not name.startswith("figures/")) == CARD
+    assert all(files[name] == (quick_folder / name).read_bytes() for name in files)
+    assert writable.repositories["me/toy"].access == "private"
+    assert f"sent: {writable.endpoint}/me/toy" in done.stdout
+    for name in files:
+        assert name in done.stdout.partition("sent: ")[0]
+    assert {request.token for request in writable.requests} == {f"Bearer {TOKEN}"}
+
+
+def test_a_whole_run_is_read_again(writable, quick_folder, inside, tmp_path):
+    done = inside("push", quick_folder, "me/toy", "--public", "--demonstrations")
+    assert done.returncode == 0, done.stderr
+    assert "which everybody may read" in done.stdout
+    assert writable.repositories["me/toy"].access == "public"
+    for name, data in pushed(writable).items():
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).write_bytes(data)
+    again, before = (fdtasil.Distilled.load(folder) for folder in (tmp_path, quick_folder))
+    rows = before.demonstrations.observations
+    assert np.array_equal(again.student.act(rows), before.student.act(rows))
+
+
+def test_a_second_push_is_a_second_commit_and_changes_no_access(writable, quick_folder, inside):
+    for _ in range(2):
+        done = inside("push", quick_folder, "me/toy")
+        assert done.returncode == 0, done.stderr
+    assert len(writable.repositories["me/toy"].commits) == 2
+    assert len([path for path in writable.asked() if path == "/api/repos/create"]) == 1
+
+
+def test_nothing_is_pushed_to_a_public_repository_by_accident(writable, quick_folder, inside):
+    writable.repositories["org/repo"].owner = TOKEN
+    refused = inside("push", quick_folder, "org/repo")
+    assert refused.returncode == 2
+    assert "everybody may read it" in refused.stderr
+    assert len(writable.repositories["org/repo"].commits) == 1
+    assert inside("push", quick_folder, "org/repo", "--public").returncode == 0
+    assert pushed(writable, "org/repo").keys() >= set(CARD)
+
+
+def test_who_may_not_write_is_told_so(writable, quick_folder, inside):
+    refused = inside("push", quick_folder, "org/repo", "--public")  # of another owner
+    assert refused.returncode == 1
+    assert "does not let you write to org/repo (HTTP 403)" in refused.stderr
+    writable.writers.clear()
+    assert "write to me/toy (HTTP 403)" in inside("push", quick_folder, "me/toy").stderr
+    assert "me/toy" not in writable.repositories
+
+
+def test_nobody_is_logged_in(hub, quick_folder, inside):
+    refused = inside("push", quick_folder, "me/toy")
+    assert refused.returncode == 1
+    assert "nobody is logged in" in refused.stderr
+    assert "`hf auth login`" in refused.stderr
+    assert hub.asked() == []
+
+
+@pytest.mark.parametrize(
+    "name", ["toy", "me/", "/toy", "me/toy/more", "me/to y", "me/..", "a--b/c"]
+)
+def test_no_name_of_a_repository(name, writable, quick_folder, inside):
+    refused = inside("push", quick_folder, name)
+    assert refused.returncode == 2
+    assert "org/name" in refused.stderr
+    assert writable.asked() == []
+
+
+def test_no_run_to_push(writable, tmp_path, inside):
+    refused = inside("push", tmp_path, "me/toy")
+    assert refused.returncode == 1
+    assert "expected: " in refused.stderr
+    assert writable.asked() == []
+
+
+@pytest.mark.parametrize("place", ["/api/models/", "/commit/"])
+def test_a_hub_that_takes_nothing(place, writable, quick_folder, inside):
+    writable.broken = (place, 500)
+    refused = inside("push", quick_folder, "me/toy")
+    assert refused.returncode == 1
+    assert "HTTP 500" in refused.stderr
+    assert "Traceback" not in refused.stderr
+
+
+def test_pushing_without_huggingface_hub(surroundings, quick_folder, inside):
+    surroundings.setitem(sys.modules, "huggingface_hub", None)
+    refused = inside("push", quick_folder, "me/toy")
+    assert refused.returncode == 1
+    assert 'pip install "fdtasil[hub]"' in refused.stderr
+
+
 # --- the stand-in itself
 
 

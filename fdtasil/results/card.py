@@ -44,7 +44,8 @@ def card_of(result: Any) -> str:
             "\n".join(warnings) + "\n",
             "## Files\n",
             "`student.onnx` (input `obs`, normaliser and bounds inside), `student.safetensors`, "
-            "`demonstrations.npz`, `report.json`, `config.json`, `figures/`.\n",
+            "`report.json`, `figures/`. A whole run also has `demonstrations.npz`, `config.json` "
+            "and `progress.csv`.\n",
             "## Again\n",
             f"```python\n{call_of(result.settings)}```\n",
         ]

@@ -112,7 +112,7 @@ class Distilled:
             path: Ends with ".onnx" (input `obs` (batch, n), output `actions`, normaliser and
                 action bounds inside; `metadata_props` says the rest), ".int8.onnx",
                 ".safetensors", ".c" (C99 without malloc; `-DSTUDENT_MAIN` makes it a program of
-                lines) or ".h", its header.
+                lines), ".int8.c" (weights in eight bits) or ".h", the header of both; ".tflite".
                 Where actions are choices, the ONNX file has the outputs `scores` and `actions`.
                 ".py" is a program that needs numpy alone, and opens the ".safetensors".
             inputs: "flat", or "keys" for an ONNX file with one input for each part of a

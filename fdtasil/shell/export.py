@@ -18,9 +18,10 @@ def command(run: RunFolder, file: OutFile) -> None:
 
     Args:
         run: Folder of a finished run.
-        file: Ends with .onnx, .int8.onnx, .safetensors, .c (C99 without malloc; compiled and
-            compared with the student where there is a compiler), .h (its header) or .py (what
-            answers with numpy alone, from the .safetensors).
+        file: Ends with .onnx, .int8.onnx, .safetensors, .tflite, .c (C99 without malloc;
+            compiled and compared with the student where there is a compiler), .int8.c (weights
+            in eight bits), .h (the header of both) or .py (what answers with numpy alone, from
+            the .safetensors).
     """
     print(f"written: {Distilled.load(run).export(file)}")
     if file.suffix == ".py":

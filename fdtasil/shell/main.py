@@ -24,6 +24,7 @@ COMMANDS = {
     "report": "everything that a run knows, on one page",
     "render": "a film of policies side by side",
     "export": "the student of a run as ONNX, C or numpy",
+    "push": "a run to the Hugging Face hub",
     "export-sb3": "an agent of stable-baselines3 as one ONNX file",
 }
 """What each command is about; its module is named so, and has a function `command`."""

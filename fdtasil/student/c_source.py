@@ -1,7 +1,8 @@
 """A student as C99: no malloc, no file, no library but libm; one function on float arrays."""
 
 import hashlib
-from collections.abc import Mapping
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -9,17 +10,34 @@ from fdtasil.errors import ExportError
 from fdtasil.files.compiled import answers_of, compiler
 from fdtasil.student.plain import PlainPolicy
 
-__all__ = ["c_header", "c_source", "check_parity"]
+__all__ = ["FLOAT", "Layers", "c_header", "c_source", "check_parity"]
 
 _BEND = {
     "elu": "x > 0.0f ? x : expm1f(x)",
     "gelu": "0.5f * x * (1.0f + erff(x * 0.70710678f))",
-    "relu": "x > 0.0f ? x : 0.0f",
+    "relu": "x < 0.0f ? 0.0f : x",
     "silu": "x * (0.5f + 0.5f * tanhf(0.5f * x))",
     "tanh": "tanhf(x)",
 }
 _A_LINE = 8  # numbers
-_AGREEMENT = 1e-5  # of half the range of an action
+_TYPES = {np.dtype(np.float32): "float", np.dtype(np.int8): "signed char"}
+
+
+@dataclass(frozen=True)
+class Layers:
+    """How a file holds the weights of its layers, and multiplies by them.
+
+    Attributes:
+        arrays: Number of a layer, (outputs, inputs) weights -> what is written of them, by name:
+            the first arguments of the function.
+        function: The widest layer's width -> the C function `linear`.
+        agreement: How far compiled answers may be from the policy's, in halves of an action's
+            range.
+    """
+
+    arrays: Callable[[int, np.ndarray], Mapping[str, np.ndarray]]
+    function: Callable[[int], str]
+    agreement: float
 
 
 def c_header(policy: PlainPolicy) -> str:
@@ -37,42 +55,42 @@ def c_header(policy: PlainPolicy) -> str:
     )
 
 
-def c_source(policy: PlainPolicy, about: Mapping[str, str]) -> str:
+def c_source(policy: PlainPolicy, about: Mapping[str, str], layers: Layers | None = None) -> str:
     """Return the C file of a student, which `-DSTUDENT_MAIN` makes a program of lines.
 
     Args:
         policy: The student.
         about: Lines of the comment at the top, by name.
+        layers: How weights are held; left out, as float32.
     """
+    layers = layers or FLOAT
     widths = [len(policy.mean), *(len(biases) for _, biases in policy.layers)]
-    deep, bend = len(policy.layers) > 1, _BEND_TEXT.format(_BEND[policy.activation])
-    arrays = {"mean": policy.mean, "scale": policy.scale}
-    for number, (weights, biases) in enumerate(policy.layers):
-        arrays |= {f"w{number}": weights, f"b{number}": biases}
-    bounds = {"bounded": policy.bounded, "centre": policy.centre, "half": policy.half}
-    plain = {
-        name: np.asarray(array, np.float32).ravel() for name, array in (arrays | bounds).items()
-    }
+    held = [layers.arrays(number, weights) for number, (weights, _) in enumerate(policy.layers)]
+    arrays: dict[str, np.ndarray] = {"mean": policy.mean, "scale": policy.scale}
+    for number, (_, biases) in enumerate(policy.layers):
+        arrays |= {**held[number], f"b{number}": biases}
+    arrays |= {"bounded": policy.bounded, "centre": policy.centre, "half": policy.half}
+    plain = {name: _plain(array) for name, array in arrays.items()}
     digest = hashlib.sha256(b"".join(array.tobytes() for array in plain.values())).hexdigest()
-    count, widest = sum(map(np.size, plain.values())), max(widths)
+    deep, widest = len(policy.layers) > 1, max(widths)
+    buffers = ["first", "second"] if deep else ["first"]
     comment = {
         **about,
         "layers": " -> ".join(map(str, widths)) + f", {policy.activation}",
-        "numbers": f"{count:,} float constants, {(1 + deep) * widest} floats of static memory",
+        "constants": f"{sum(array.nbytes for array in plain.values()):,} bytes",
         "sha256": f"{digest} of the constants",
     }
     lines = "\n".join(f"   {name}: {_plainly(text)}" for name, text in comment.items())
-    calls = [_call(number, len(widths) - 2) for number in range(len(widths) - 1)]
-    declared = c_header(policy).partition("*/\n")[2]
+    calls = (_call(number, len(held) - 1, names) for number, names in enumerate(held))
     return "\n".join(
         [
             f"/* Written by fdtasil. C99, -lm.\n{lines}\n*/",
-            declared,
+            c_header(policy).partition("*/\n")[2],
             "#include <math.h>\n",
             *(_array(name, array) for name, array in plain.items()),
-            f"static float first[{widest}];\n",
-            *([f"static float second[{widest}];\n", bend] if deep else []),
-            _LINEAR,
+            *(f"static float {name}[{widest}];\n" for name in buffers),
+            *([_BEND_TEXT.format(_BEND[policy.activation])] if deep else []),
+            layers.function(max(widths[:-1])),
             "void student(const float observation[STUDENT_OBSERVATIONS],\n"
             "             float action[STUDENT_ACTIONS])\n{",
             "    int i;\n    float raw[STUDENT_ACTIONS];",
@@ -90,28 +108,35 @@ def c_source(policy: PlainPolicy, about: Mapping[str, str]) -> str:
     )
 
 
+def _plain(array: np.ndarray) -> np.ndarray:
+    return np.asarray(array, array.dtype if array.dtype in _TYPES else np.float32).ravel()
+
+
 def _plainly(text: str) -> str:
     """Return a text that ends no comment."""
     return "".join(c if c.isprintable() else "?" for c in text).replace("*", "?")[:200]
 
 
 def _array(name: str, values: np.ndarray) -> str:
-    # Nine digits read back as the same float32.
     numbers = [_number(value) for value in values]
     rows = [", ".join(numbers[i : i + _A_LINE]) for i in range(0, len(numbers), _A_LINE)]
-    return f"static const float {name}[{len(values)}] = {{\n" + ",\n".join(rows) + "};\n"
+    kind = _TYPES[values.dtype]
+    return f"static const {kind} {name}[{len(values)}] = {{\n" + ",\n".join(rows) + "};\n"
 
 
-def _number(value: float) -> str:
-    text = f"{float(value):.9g}"
+def _number(value: np.generic) -> str:
+    if isinstance(value, np.integer):
+        return str(value)
+    text = f"{float(value):.9g}"  # reads back as the same float32
     return text + ("f" if set(text) & set(".e") else ".0f")
 
 
-def _call(number: int, last: int) -> str:
+def _call(number: int, last: int, names: Iterable[str]) -> str:
     source, target = ("first", "second") if number % 2 == 0 else ("second", "first")
     if number == last:
         target = "raw"
-    line = f"    linear(w{number}, b{number}, {source}, {target}, {{inputs}}, {{outputs}});"
+    given = f"{', '.join(names)}, b{number}, {source}, {target}, {{inputs}}, {{outputs}}"
+    line = f"    linear({given});"
     return line if number == last else f"{line}\n    bend({target}, {{outputs}});"
 
 
@@ -124,18 +149,28 @@ _BEND_TEXT = """static void bend(float *values, int count)
     }}
 }}
 """
+# Four sums side by side: a processor need not wait for one before it adds the next.
 _LINEAR = """static void linear(const float *weights, const float *biases, const float *input,
                    float *output, int inputs, int outputs)
 {
     int i, j;
     for (i = 0; i < outputs; i++) {
-        float sum = biases[i];
-        for (j = 0; j < inputs; j++)
-            sum += weights[i * inputs + j] * input[j];
-        output[i] = sum;
+        const float *row = weights + i * inputs;
+        float a = biases[i], b = 0.0f, c = 0.0f, d = 0.0f;
+        for (j = 0; j + 3 < inputs; j += 4) {
+            a += row[j] * input[j];
+            b += row[j + 1] * input[j + 1];
+            c += row[j + 2] * input[j + 2];
+            d += row[j + 3] * input[j + 3];
+        }
+        for (; j < inputs; j++)
+            a += row[j] * input[j];
+        output[i] = (a + b) + (c + d);
     }
 }
 """
+FLOAT = Layers(lambda number, weights: {f"w{number}": weights}, lambda widest: _LINEAR, 1e-5)
+"""Weights as they are."""
 _MAIN = """#ifdef STUDENT_MAIN
 #include <stdio.h>
 /* Reads observations, numbers with spaces between, and writes a line of actions for each. */
@@ -157,8 +192,16 @@ int main(void)
 """
 
 
-def check_parity(source: str, policy: PlainPolicy, states: np.ndarray) -> None:
+def check_parity(
+    source: str, policy: PlainPolicy, states: np.ndarray, agreement: float = FLOAT.agreement
+) -> None:
     """Compile a student's own C file and compare it with the student, where there is a compiler.
+
+    Args:
+        source: The file.
+        policy: Whose answers it must give.
+        states: (B, n) observations.
+        agreement: How far they may be apart, in halves of an action's range.
 
     Raises:
         ExportError: If it can't be compiled, or its answers differ.
@@ -167,9 +210,9 @@ def check_parity(source: str, policy: PlainPolicy, states: np.ndarray) -> None:
         return
     answers = answers_of(source, "STUDENT_MAIN", states)
     difference = float(np.abs((answers - policy(states)) / policy.half).max())
-    if not difference <= _AGREEMENT:
+    if not difference <= agreement:
         raise ExportError(
             f"the C file and the student differ by {difference:.1e} of half the range",
-            f"at most {_AGREEMENT:g} on {len(states)} states",
+            f"at most {agreement:g} on {len(states)} states",
             "look for weights of very different sizes",
         )

@@ -10,11 +10,13 @@ from fdtasil.checks import check_choice
 from fdtasil.errors import ExportError, SettingError
 from fdtasil.files.onnx.export import check_finite, export_module
 from fdtasil.student import plain
+from fdtasil.student.c_int8 import INT8, rounded
 from fdtasil.student.c_source import c_header, c_source, check_parity
-from fdtasil.student.int8 import as_int8
+from fdtasil.student.int8 import as_int8, check_change
 from fdtasil.student.own_form import check_own_form, own_form
 from fdtasil.student.plain import PlainPolicy
 from fdtasil.student.policy import Student
+from fdtasil.student.tflite import tflite_model
 
 __all__ = ["EXPORTS", "export"]
 
@@ -69,6 +71,19 @@ def _c(student: Student, states: np.ndarray, metadata: Mapping[str, str]) -> byt
     return source.encode()
 
 
+def _int8_c(student: Student, states: np.ndarray, metadata: Mapping[str, str]) -> bytes:
+    policy = _plain(student)
+    small = rounded(policy)
+    check_change(small(states), student, states, "export it as .c")
+    source = c_source(policy, metadata, INT8)
+    check_parity(source, small, states, INT8.agreement)
+    return source.encode()
+
+
+def _tflite(student: Student, states: np.ndarray, metadata: Mapping[str, str]) -> bytes:
+    return tflite_model(_plain(student), states, metadata)
+
+
 def _h(student: Student, states: np.ndarray, metadata: Mapping[str, str]) -> bytes:
     return c_header(_plain(student)).encode()
 
@@ -82,6 +97,8 @@ EXPORTS: dict[str, Writer] = {
     ".int8.onnx": _int8,
     ".onnx": _onnx,
     ".safetensors": _safetensors,
+    ".tflite": _tflite,
+    ".int8.c": _int8_c,
     ".c": _c,
     ".h": _h,
     ".py": _py,

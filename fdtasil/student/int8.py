@@ -17,7 +17,7 @@ from fdtasil.files.reading import read_plain
 from fdtasil.files.storage import write_bytes
 from fdtasil.student.policy import Student
 
-__all__ = ["as_int8"]
+__all__ = ["as_int8", "check_change"]
 
 _BATCHES = 8  # that the calibration is read in
 _AROUND = 0.5  # deviations that half of its states are moved by, as probes move them
@@ -51,14 +51,29 @@ def as_int8(written: bytes, student: Student, states: np.ndarray, output: str) -
             "export it as .onnx",
         ) from error
     answers = run_session(open_session(data, "the int8 export"), output, states)
+    check_change(answers, student, states, "export it as .onnx")
+    return data
+
+
+def check_change(answers: np.ndarray, student: Student, states: np.ndarray, way: str) -> None:
+    """Refuse eight bits in which a student is not itself.
+
+    Args:
+        answers: (B, m) in eight bits.
+        student: The student.
+        states: (B, n) what was answered.
+        way: What to do instead of training a wider student.
+
+    Raises:
+        ExportError: If actions change by more than 5 % of their unit on the mean.
+    """
     apart = np.abs(answers - student.act(states)) / student.action_units.numpy()
     if not float(apart.mean()) <= _MOST:
         raise ExportError(
             f"in int8 the student's actions change by {apart.mean():.1%} of their unit",
             f"at most {_MOST:.0%} on the mean",
-            "train a wider student, or export it as .onnx",
+            f"train a wider student, or {way}",
         )
-    return data
 
 
 def _quantised(written: bytes, rows: np.ndarray) -> bytes:
