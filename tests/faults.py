@@ -237,6 +237,9 @@ FAULTS = {
         220: "a law that switches, probed too near",
         221: "texts of a run that would be code on a page",
         222: "a file in eight bits that is another policy",
+        223: "an observation that is no number, which code in C turned into an action",
+        224: "a run with a memory or a history, learnt from as if it had none",
+        225: "a fetched expert that is another file than the manifest says",
     },
 }
 

@@ -123,6 +123,7 @@ def test_a_student_that_eight_bits_change_is_refused():
 
 
 @needs_a_compiler
+@pytest.mark.fault(223)
 @pytest.mark.parametrize("name", ["student.c", "student.int8.c"])
 @pytest.mark.parametrize("activation", ACTIVATIONS)
 def test_what_is_no_number_is_answered_with_none(activation, name, tmp_path):

@@ -176,6 +176,7 @@ def test_what_was_recorded_with_a_memory_is_learnt_again_without_asking(history,
     assert (stored.history, stored.remembered, stored.own_size) == (history, 6, N)
 
 
+@pytest.mark.fault(224)
 def test_another_past_or_memory_than_the_datasets_is_refused(file):
     with_memory = fdtasil.distill(Remembers(), TOY, 0, **RUN).dataset
     with pytest.raises(SettingError, match="remembers nothing, beside states of one"):
