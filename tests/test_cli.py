@@ -135,6 +135,13 @@ def test_what_is_said_in_a_shell_is_what_the_function_is_given(called, inside, t
     assert isinstance(called["callback"], fdtasil.Log)
 
 
+def test_a_student_by_its_name(called, inside, tmp_path):
+    assert inside("distill", "e.onnx", TOY, "--student", "micro", cwd=tmp_path).returncode == 130
+    assert called["student"] == "micro"
+    wrong = inside("distill", "e.onnx", TOY, "--student", "micro", "--hidden", "8", cwd=tmp_path)
+    assert "--student micro beside --hidden" in wrong.stderr
+
+
 @pytest.mark.parametrize("name", COMMANDS)
 def test_every_argument_is_explained(name, inside, monkeypatch):
     monkeypatch.setenv("COLUMNS", "120")

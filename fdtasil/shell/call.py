@@ -86,6 +86,12 @@ def distil(arguments: Arguments, *, progress: bool = True) -> Distilled:
     fit = {field.name: rest.pop(field.name) for field in fields(Fit)}
     said = {field.name: rest.pop(field.name) for field in fields(Mlp)}
     network = {name: value for name, value in said.items() if value is not None}
+    student = rest.pop("student", None)
+    if student is not None and network:
+        flags = " ".join(f"--{name}" for name in network)
+        raise SettingError(
+            f"--student {student} beside {flags}", "one of them", f"leave out {flags}"
+        )
     output, inputs, trust = (rest.pop(name) for name in ("output", "inputs", "trust"))
     formats = rest.pop("log_formats")
     rest["student_obs"] = seen(rest.get("student_obs"))
@@ -95,7 +101,7 @@ def distil(arguments: Arguments, *, progress: bool = True) -> Distilled:
     folder = Path(rest["out"] or rest["resume"] or ".")
     return distill(
         **rest,
-        student=Mlp(**network) if network else None,
+        student=Mlp(**network) if network else student,
         fit=preset_of(rest["preset"]).fit_with(**fit),
         callback=Log(folder / "log", *formats) if formats else None,
         progress=progress,

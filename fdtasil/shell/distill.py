@@ -191,21 +191,14 @@ command = as_command(
     [
         Flags(
             distill,
-            without=(
-                "student",
-                "fit",
-                "constraints",
-                "callback",
-                "progress",
-                "out",
-                "device",
-            ),
+            without=("fit", "constraints", "callback", "progress", "out", "device"),
             types={
                 "expert": OptionalExpert,
                 "env": OptionalEnvironment,
                 "probes": str | None,
                 "trainer": str,
                 "dataset": str | None,
+                "student": str | None,
                 "student_obs": tuple[str, ...] | None,
                 "spread": str | None,
                 "resume": Path | None,
