@@ -1,9 +1,10 @@
 """Other packages for the same purpose, measured beside this one.
 
-    python -m benchmarks.peers.environment    # once: minutes, and some gigabytes
+    python -m benchmarks.peers    # once: makes the environments, some gigabytes
     python -m benchmarks run peers
 
-Each peer runs as a process in an environment of its own. Nothing of it is imported here.
+Each peer runs as a process in an environment of its own, in `.peers/` or the folder that
+FDTASIL_PEERS names. Nothing of it is imported here. All seconds are the processor's.
 """
 
 from benchmarks.peers.benchmark import cells, draw, run

@@ -39,5 +39,5 @@ def draw(rows: Sequence[Row]) -> dict[str, bytes]:
     for what, kind in KINDS.items():
         mine = [row for row in rows if row["cell"]["what"] == what]
         if mine:
-            parts.append(kind.text(mine))
+            parts.append(f"{(kind.__doc__ or '').strip()}\n\n{kind.text(mine)}")
     return {"peers.md": "\n".join(parts).encode()}

@@ -1,15 +1,12 @@
-"""Makes the environments that the peers run in: `python -m benchmarks.peers.environment NAME ...`.
+"""The environments that the peers run in: where they are, and what they hold.
 
-What they need would hold this project's own packages back, so each has an environment of its own.
+What a peer needs would hold this project's own packages back, so each has one of its own.
 """
 
-import argparse
 import os
-import subprocess
-import sys
 from pathlib import Path
 
-__all__ = ["PEERS", "PeerMissing", "check_peer", "python_of"]
+__all__ = ["FOLDER", "PEERS", "ROOT", "PeerMissing", "check_peer", "python_of"]
 
 ROOT = Path(__file__).parent.parent.parent
 FOLDER = Path(os.environ.get("FDTASIL_PEERS", ROOT / ".peers"))
@@ -46,23 +43,5 @@ def check_peer(name: str) -> None:
     """
     if not (FOLDER / name / "ready").exists():
         raise PeerMissing(
-            f"no environment of {name} in {FOLDER}; "
-            f"make it: python -m benchmarks.peers.environment {name}"
+            f"no environment of {name} in {FOLDER}; make it: python -m benchmarks.peers {name}"
         )
-
-
-def make(name: str) -> None:
-    """Make a peer's environment anew, with the versions of `constraints.txt`."""
-    subprocess.run([sys.executable, "-m", "venv", "--clear", FOLDER / name], check=True)
-    pip = [python_of(name), "-m", "pip", "install", "--quiet", "--disable-pip-version-check"]
-    for wanted in PEERS[name]:
-        subprocess.run([*pip, "-c", ROOT / "constraints.txt", *wanted], check=True)
-    (FOLDER / name / "ready").touch()
-
-
-if __name__ == "__main__":
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.peers.environment")
-    parser.add_argument("names", nargs="*", help="all, if none is named")
-    for peer in parser.parse_args().names or PEERS:
-        make(peer)
-        print(python_of(peer))
