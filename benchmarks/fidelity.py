@@ -52,13 +52,14 @@ def run(cell: Cell, device: str) -> dict[str, Any]:
 
 
 def draw(rows: Sequence[Row]) -> dict[str, bytes]:
-    """A line for each expert: return and errors of its students, and how their ranks agree."""
+    """A line for each expert: return and errors of its students, how their ranks agree, bounds."""
     experts = list(dict.fromkeys(row["cell"]["expert"] for row in rows))
     heads = ["expert", *(f"{name}: return, derivatives, actions" for name in STUDENTS)]
     heads += [f"rank correlation of return and {name}" for name in ERRORS]
+    heads += ["distance to the expert's path after 25 steps: bounded, measured"]
     lines = [_line(e, [row for row in rows if row["cell"]["expert"] == e]) for e in experts]
     if len(experts) > 1:
-        lines.append(["all", *[""] * len(STUDENTS), *_agreements(rows)])
+        lines.append(["all", *[""] * len(STUDENTS), *_agreements(rows), ""])
     return {"fidelity.md": table(heads, lines).encode()}
 
 
@@ -69,7 +70,17 @@ def _line(expert: str, rows: Sequence[Row]) -> list[str]:
         names = ("normalized_return", *ERRORS) if found else ()
         means = (sum(one[name] for one in found) / len(found) for name in names)
         cells.append(", ".join(f"{mean:.2f}" for mean in means) or "-")
-    return [expert, *cells, *_agreements(rows)]
+    return [expert, *cells, *_agreements(rows), _distances(rows)]
+
+
+def _distances(rows: Sequence[Row]) -> str:
+    """Return the bound and the measured distance of the good students, in deviations."""
+    good = [row["result"] for row in rows if row["cell"]["student"] == "good"]
+    bounds = [one["bound"] for one in good if one["bound"] is not None]
+    if not good:
+        return "-"
+    bound = f"{sum(bounds) / len(bounds):.3g}" if bounds else "no law"
+    return f"{bound}, {sum(one['gap'] for one in good) / len(good):.2g}"
 
 
 def _agreements(rows: Sequence[Row]) -> list[str]:
