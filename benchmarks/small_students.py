@@ -118,10 +118,15 @@ def draw(rows: Sequence[Row]) -> dict[str, bytes]:
     heads += ["microseconds as C, in onnxruntime", "smallest cloned"]
     small = table(heads, [_smallest(expert, results) for expert, results in found.items()])
     every = table(["expert", "", *(f"{w} x {w}" for w in WIDTHS)], _every(found))
-    curves = {expert: _curves(results) for expert, results in found.items()}
+    curves = {
+        expert: {name: dict(enumerate(of.values())) for name, of in _curves(results).items()}
+        for expert, results in found.items()
+    }
     files = {"small_students.md": f"{small}\n{every}".encode()}
     if curves:
-        files["small_students.png"] = draw_panels(curves, "width of two hidden layers")
+        files["small_students.png"] = draw_panels(
+            curves, "width of two hidden layers", ticks=[str(width) for width in WIDTHS]
+        )
     return files
 
 
