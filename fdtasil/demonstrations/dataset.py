@@ -20,6 +20,7 @@ from fdtasil.files.reading import from_json, read_plain
 from fdtasil.files.storage import is_written, verify
 from fdtasil.probes.answers import Answers
 from fdtasil.probes.source import Probes
+from fdtasil.rollouts.history import past_size
 from fdtasil.rollouts.spaces import Spaces
 
 __all__ = ["Dataset", "DatasetLike", "check_dataset", "check_shapes", "load_dataset"]
@@ -295,15 +296,16 @@ def _read(arrays: Mapping[str, np.ndarray]) -> Dataset:
         answers = Answers(bank, numbers, values, gains)
     bounds = typed["low"], typed["high"]
     spaces = Spaces.from_json(about["spaces"]) if "spaces" in about else None
-    behind = (as_kind(int, about.get("history", 1), "history"),)
-    behind += (as_kind(int, about.get("remembered", 0), "remembered"),)
-    found = Dataset(
-        demonstrations, _probes(spec, answers), answers, *bounds, environment, spaces, *behind
+    history, remembered = (
+        as_kind(int, about.get(name, usual), name)
+        for name, usual in (("history", 1), ("remembered", 0))
     )
+    behind = spaces, history, remembered
+    found = Dataset(demonstrations, _probes(spec, answers), answers, *bounds, environment, *behind)
     n, m = found.sizes
-    own = n - found.remembered - (found.history - 1) * m
-    if found.history < 1 or found.remembered < 0 or own < found.history or own % found.history:
-        raise ValueError(f"{n} observations with history {behind[0]} and memory {behind[1]}")
+    good = history >= 1 and remembered >= 0 and found.own_size >= 1
+    if not good or n != found.own_size + past_size(history, found.own_size, m) + remembered:
+        raise ValueError(f"{n} observations with history {history} and memory {remembered}")
     if spaces and spaces.actions.size != found.sizes[1]:
         raise ValueError("actions of another size than their space")
     return found

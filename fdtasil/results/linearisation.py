@@ -1,7 +1,7 @@
 """The closed loop around single states: eigenvalues of its linearisation, in MuJoCo."""
 
 import copy
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import Any
@@ -73,8 +73,7 @@ def linearise(
     if not _is_mujoco(simulator, pool.boxes.action_size):
         return None
     for seed in seeds:
-        options = dict(pool.options) if isinstance(pool.options, Mapping) else None
-        seen, _ = env.reset(seed=int(seed), options=options)
+        seen, _ = env.reset(seed=int(seed), **pool.reset_options)
         for step in range(max(steps) + 1):
             if not np.allclose(_observed(simulator), np.ravel(seen), atol=1e-5):
                 return None

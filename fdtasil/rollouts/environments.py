@@ -1,5 +1,6 @@
 """What an environment argument means: an id, an instance or a factory, and its two spaces."""
 
+import copy
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -157,6 +158,11 @@ class EnvironmentPool:
             self.name, self.time_limit = self.together.name, self.together.time_limit
             self.spaces = _spaces_of(self.together, self.name)
             self.boxes, self.bounds = _read_boxes(self.together, self.name, self.spaces)
+
+    @property
+    def reset_options(self) -> dict[str, Any]:
+        """The options of a reset as its arguments: a copy, which it may change, or none."""
+        return {} if self.options is None else {"options": copy.deepcopy(self.options)}
 
     def take(self, count: int) -> list[gymnasium.Env]:
         """Return up to `count` copies; fewer where only one exists."""

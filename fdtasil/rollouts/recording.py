@@ -34,7 +34,8 @@ class Recording:
 
     def __init__(self, seeds: Sequence[int], horizon: int, pool: EnvironmentPool) -> None:
         n, m = pool.boxes.observation_size, pool.boxes.action_size
-        self._bounds, self._name, self.options = pool.bounds, pool.name, pool.options
+        self._pool, self._bounds, self._name = pool, pool.bounds, pool.name
+        self.options = pool.options
         self._seeds, episodes = [int(seed) for seed in seeds], len(seeds)
         self.observations = np.zeros((episodes, horizon, n), np.float32)
         self.actions = np.zeros((episodes, horizon, m), np.float32)
@@ -56,7 +57,7 @@ class Recording:
     def reset(self, environment: gymnasium.Env, episode: int) -> np.ndarray:
         """Return the first observation of an episode."""
         try:
-            answer = environment.reset(seed=self._seeds[episode], **self._given)
+            answer = environment.reset(seed=self._seeds[episode], **self._pool.reset_options)
         except Mismatch as mismatch:
             raise self._promised(episode, None, mismatch) from None
         except Exception as error:
@@ -246,10 +247,6 @@ class Recording:
     def _where(self, episode: int, step: int | None) -> str:
         when = "" if step is None else f", step {step}"
         return f"{self._name}, episode {episode} (seed {self._seeds[episode]}){when}"
-
-    @property
-    def _given(self) -> dict[str, Any]:
-        return {} if self.options is None else {"options": copy.deepcopy(self.options)}
 
     def _promised(self, episode: int, step: int | None, mismatch: Mismatch) -> EnvironmentFault:
         found = f"an observation with {mismatch}"

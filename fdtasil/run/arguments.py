@@ -90,12 +90,12 @@ class Arguments:
         """
         if subject.spaces and subject.spaces.actions.choices and self.trainer is not None:
             check_choices(self.trainer)
-        if self.trainer is not None and isinstance(self.trainer, DAgger | Dart):
-            if len(self.trainer.rounds(self.episodes)) == 1:
-                warn(
-                    f"{self.episodes} episode(s) leave trainer={self.trainer.name!r} one round, "
-                    "in which the expert acts as in cloning: raise episodes="
-                )
+        trainer = self.trainer
+        if isinstance(trainer, DAgger | Dart) and len(trainer.rounds(self.episodes)) == 1:
+            warn(
+                f"{self.episodes} episode(s) leave trainer={trainer.name!r} one round, "
+                "in which the expert acts as in cloning: raise episodes="
+            )
         usual = self._usual(subject)
         if self.anew is None or subject.expert is None:
             return usual

@@ -18,7 +18,12 @@ from fdtasil.results.fidelity import Fidelity, fidelity_of
 from fdtasil.results.linearisation import Linearisation, linearise
 from fdtasil.results.stability import Stability, distances, stability_of
 from fdtasil.rollouts.behaviours import follow
-from fdtasil.rollouts.environments import EnvironmentLike, EnvironmentPool, resolve_horizon
+from fdtasil.rollouts.environments import (
+    EnvironmentLike,
+    EnvironmentPool,
+    resolve_horizon,
+    simulator_warnings,
+)
 from fdtasil.rollouts.rollout import rollout
 from fdtasil.run.judging import judged_in
 from fdtasil.run.subject import visible
@@ -167,7 +172,8 @@ def diagnose(
         largest = float(errors.max(axis=1).mean())
         gap = float(distances(first, path, scales).mean())
         looked = sorted({0, short // 2, short - 1})
-        loops = linearise(pool, asked.policy("evaluate"), act, starts[:_LOOKED], looked)
+        with simulator_warnings():
+            loops = linearise(pool, asked.policy("evaluate"), act, starts[:_LOOKED], looked)
         return Diagnosis(
             fidelity,
             stability,

@@ -119,9 +119,7 @@ class _Player:
             self._act = _acting(policy, self.pool)
             (self._env,) = self.pool.take(1)
             _follow(self._env)
-            self._seen = np.asarray(
-                self._env.reset(seed=seed, options=_copied(self.pool.options))[0]
-            )
+            self._seen = np.asarray(self._env.reset(seed=seed, **self.pool.reset_options)[0])
             self.picture = self._drawn()
         except BaseException:
             self.pool.close()
@@ -189,10 +187,6 @@ def _follow(env: gymnasium.Env) -> None:
         known: Any = mujoco  # the type stubs do not know all of it
         kind = known.mjtObj.mjOBJ_CAMERA
         drawer.camera_id = known.mj_name2id(drawer.model, kind, "track")  # -1 if there is none
-
-
-def _copied(options: Mapping[str, Any] | None) -> dict[str, Any] | None:
-    return None if options is None else dict(options)
 
 
 def _drawing(env: EnvironmentLike) -> EnvironmentLike:

@@ -176,7 +176,7 @@ def distill(
     limits = None if constraints is None else check_constraints(constraints)
     progress = check_flag("progress", progress)
     given = None if dataset is None else load_dataset(dataset)
-    history = history_with(check_history(history, student_obs), given)
+    history = history_with(check_count("history", history), given)
     check_history(history, student_obs)
     arguments = read_arguments(
         given,

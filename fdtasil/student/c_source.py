@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fdtasil.errors import ExportError
 from fdtasil.files.compiled import answers_of, compiler
+from fdtasil.student.agreement import check_agreement
 from fdtasil.student.plain import PlainPolicy
 
 __all__ = ["FLOAT", "Layers", "c_header", "c_source", "check_parity"]
@@ -209,10 +209,4 @@ def check_parity(
     if compiler() is None:
         return
     answers = answers_of(source, "STUDENT_MAIN", states)
-    difference = float(np.abs((answers - policy(states)) / policy.half).max())
-    if not difference <= agreement:
-        raise ExportError(
-            f"the C file and the student differ by {difference:.1e} of half the range",
-            f"at most {agreement:g} on {len(states)} states",
-            "look for weights of very different sizes",
-        )
+    check_agreement("C", answers, policy, states, agreement)

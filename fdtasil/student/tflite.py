@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 
 from fdtasil.errors import ExportError, first_line
+from fdtasil.student.agreement import check_agreement
 from fdtasil.student.plain import PlainPolicy
 
 __all__ = ["tflite_model"]
 
-_AGREEMENT = 1e-5  # of half the range of an action
 _BENDS = {"elu": "ELU", "gelu": "GELU", "relu": "RELU", "tanh": "TANH"}
 
 
@@ -51,13 +51,7 @@ def tflite_model(policy: PlainPolicy, states: np.ndarray, about: Mapping[str, st
     interpreter.set_tensor(given, np.asarray(states, np.float32))
     interpreter.invoke()
     answers = interpreter.get_tensor(interpreter.get_output_details()[0]["index"])
-    apart = float(np.abs((answers - policy(states)) / policy.half).max())
-    if not apart <= _AGREEMENT:
-        raise ExportError(
-            f"the .tflite file and the student differ by {apart:.1e} of half the range",
-            f"at most {_AGREEMENT:g} on {len(states)} states",
-            "look for weights of very different sizes",
-        )
+    check_agreement(".tflite", answers, policy, states)
     return data
 
 
