@@ -58,7 +58,7 @@ def main() -> int:
         nargs="+",
         choices=BENCHMARKS,
         default=[],
-        help="take over equal distillations of these, if run on this machine with these versions",
+        help="take over equal distillations of these, if run with the versions of here",
     )
     running.add_argument("--out", type=Path, default=RESULTS, help="folder of the results files")
     drawing = commands.add_parser("draw", help="draw the figures and tables of a results file")

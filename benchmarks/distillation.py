@@ -39,10 +39,16 @@ def distillations(
     return Benchmark(name, about, cells, run, draw, arguments=arguments)
 
 
-def usual_arguments(cell: Cell) -> dict[str, Any]:
-    """Return a cell's expert, trajectories and seed, at a horizon and steps that all share."""
+def usual_arguments(cell: Cell, method: Mapping[str, Any]) -> dict[str, Any]:
+    """Return a cell's expert, trajectories and seed, at a horizon and steps that all share.
+
+    Args:
+        cell: With these three names.
+        method: Further arguments, or others; None leaves one at the library's default.
+    """
     given = {name: cell[name] for name in ("expert", "episodes", "seed")}
-    return given | {"horizon": HORIZON, "steps": STEPS}
+    settings = {**given, "horizon": HORIZON, "steps": STEPS, **method}
+    return {name: value for name, value in settings.items() if value is not None}
 
 
 def call_of(settings: Mapping[str, Any]) -> dict[str, Any]:

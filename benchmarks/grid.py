@@ -17,6 +17,8 @@ STANDARD_METHODS: dict[str, dict[str, Any]] = {
     **{str(count): {"probes": count} for count in (1, 5, 10, 50)},
     # A moved state's label counts as much as a visited state's.
     "augmentation": {"probes": "adaptive:10,labels", "weight": 1.0},
+    # Asked anew at every visit, for as many steps as the library gives it.
+    "fresh": {"probes": "fresh", "steps": None},
 }
 """By the name that cells use: settings of `benchmarks.distillation`, with the standard preset."""
 
@@ -25,6 +27,7 @@ _LABELS = {
     "jacobian": "analytic Jacobian",
     "1": "1 probe",
     "augmentation": "10 answers as labels",
+    "fresh": "fresh queries",
 }
 
 

@@ -43,7 +43,7 @@ def cells(quick: bool) -> list[Cell]:
 
 def arguments(cell: Cell) -> dict[str, Any]:
     """Return the cell's trainer and source, with `usual_arguments`."""
-    return usual_arguments(cell) | METHODS[cell["method"]]
+    return usual_arguments(cell, METHODS[cell["method"]])
 
 
 def draw(rows: Sequence[Row]) -> dict[str, bytes]:

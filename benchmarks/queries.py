@@ -22,6 +22,7 @@ BUDGETS: dict[str, tuple[int, ...]] = {
     "1": (2, 5, 20),
     "10": (2, 5, 20),
     "50": (2, 5, 20),
+    "fresh": (1, 2, 5, 20),
 }
 METHODS: dict[str, dict[str, Any]] = {
     **STANDARD_METHODS,
@@ -56,7 +57,7 @@ def cells(quick: bool) -> list[Cell]:
 
 def arguments(cell: Cell) -> dict[str, Any]:
     """Return the cell's method, with `usual_arguments`."""
-    return usual_arguments(cell) | METHODS[cell["method"]]
+    return usual_arguments(cell, METHODS[cell["method"]])
 
 
 def draw(rows: Sequence[Row]) -> dict[str, bytes]:

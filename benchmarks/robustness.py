@@ -19,9 +19,15 @@ __all__ = ["BENCHMARK"]
 
 EPISODES = 5
 EVALUATED = 10  # episodes under each disturbance
-STUDENTS = ("plain", "10", "augmentation")
+STUDENTS = ("plain", "10", "augmentation", "fresh")
 COLUMNS = ("expert", *STUDENTS)
-PAIRS = (("10", "plain"), ("10", "augmentation"), ("10", "expert"))
+PAIRS = (
+    ("10", "plain"),
+    ("10", "augmentation"),
+    ("10", "expert"),
+    ("fresh", "10"),
+    ("fresh", "expert"),
+)
 KEPT = (
     "expert_return",
     "student_return",

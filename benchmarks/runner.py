@@ -91,8 +91,8 @@ def run(
         workers: Processes at once, one thread each.
         backend: One of `BACKENDS`.
         device: Where students are trained; processes share a GPU.
-        known: From `known_results`: rows of other benchmarks, taken over where the arguments,
-            the machine and the versions are the same. Each keeps its commit: that the library
+        known: From `known_results`: rows of other benchmarks, taken over where the arguments
+            and the versions are the same. Each keeps its machine and commit: that the library
             still does the same is the caller's to know.
 
     Returns:
@@ -104,8 +104,7 @@ def run(
         with path.open("a") as file:
             file.write("\n")  # a kill cut the last line short: leave it to itself
     about = {"commit": _commit(), "versions": versions()}
-    here = {"versions": about["versions"], "machine": _machine(device)}
-    reused = _reused(benchmark, due, known or {}, here)
+    reused = _reused(benchmark, due, known or {}, about["versions"])
     due = [cell for cell in due if _key(cell) not in reused]
     failed = []
     with path.open("a") as file:
@@ -177,16 +176,16 @@ def _reused(
     benchmark: Benchmark,
     cells: Sequence[Cell],
     known: Mapping[str, Row],
-    here: Mapping[str, object],
+    here: Mapping[str, str],
 ) -> dict[str, Row]:
-    """Return the rows of those cells whose distillation another benchmark has run here."""
+    """Return the rows of those cells whose distillation another benchmark has run with these versions."""
     if benchmark.arguments is None:
         return {}
     return {
         _key(cell): {**row, "cell": dict(cell)}
         for cell in cells
         if (row := known.get(_key(benchmark.arguments(cell)))) is not None
-        and all(row[name] == value for name, value in here.items())
+        and row["versions"] == here
     }
 
 

@@ -32,7 +32,7 @@ def cells(quick: bool) -> list[Cell]:
 
 def arguments(cell: Cell) -> dict[str, Any]:
     """Return the cell's method, with `usual_arguments` but for the steps."""
-    return usual_arguments(cell) | METHODS[cell["method"]]
+    return usual_arguments(cell, METHODS[cell["method"]])
 
 
 def draw(rows: Sequence[Row]) -> dict[str, bytes]:

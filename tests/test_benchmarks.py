@@ -210,9 +210,9 @@ def test_benchmarks_share_the_results_of_equal_distillations(tmp_path):
     assert all(row["cell"]["name"] == "new" for row in rows.values())
 
 
-@pytest.mark.parametrize("name", ["machine", "versions"])
-def test_results_of_other_machines_and_versions_are_not_shared(name, tmp_path):
-    """Equal seeds give equal bytes on one machine with equal versions, and nowhere else."""
+@pytest.mark.parametrize(("name", "times"), [("machine", 1), ("versions", 2)])
+def test_results_of_other_versions_are_not_shared(name, times, tmp_path):
+    """Those of other machines are: a row names its own, and none is run twice for that."""
     ran, cells = [], [{"number": 0}]
     first, second = (tripling(title, cells, ran) for title in ("first", "second"))
     run(first, cells, first.results(tmp_path))
@@ -220,7 +220,7 @@ def test_results_of_other_machines_and_versions_are_not_shared(name, tmp_path):
         key: {**row, name: "another"} for key, row in known_results([first], tmp_path).items()
     }
     run(second, cells, second.results(tmp_path), known=known)
-    assert ran == [0, 0]
+    assert ran == [0] * times
 
 
 def test_distillations_are_sent_to_other_processes(tmp_path):
@@ -279,7 +279,7 @@ def test_return_against_queries():
 def disturbed_row(cell):
     from benchmarks.disturbances import DISTURBANCES
 
-    share = {"plain": 0.5, "10": 0.9, "augmentation": 0.8}[cell["method"]]
+    share = {"plain": 0.5, "10": 0.9, "augmentation": 0.8, "fresh": 1.0}[cell["method"]]
     calm = {"physics_resets": 0, "expert_physics_resets": 0}
     usual = {"expert_return": 200.0, "student_return": 200 * share, **calm}
     fallen = {"expert_return": 100.0, "student_return": 100 * share, **calm}
