@@ -178,7 +178,7 @@ def _reused(
     known: Mapping[str, Row],
     here: Mapping[str, str],
 ) -> dict[str, Row]:
-    """Return the rows of those cells whose distillation another benchmark has run with these versions."""
+    """Return the rows of those cells that another benchmark has run with these versions."""
     if benchmark.arguments is None:
         return {}
     return {
