@@ -1,7 +1,6 @@
 """The smallest student that keeps the level, with probes and without, and judged as compiled C."""
 
-import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -16,7 +15,7 @@ from benchmarks.panels import draw_panels
 from benchmarks.runner import Benchmark, Cell, Row
 from benchmarks.statistics import interval_text
 from benchmarks.tables import table
-from fdtasil.files.compiled import shared_function
+from fdtasil.results.size import c_microseconds, size_of_student
 
 __all__ = ["BENCHMARK"]
 
@@ -25,7 +24,6 @@ KEEP = 0.95
 WIDTHS = (16, 32, 64, 128, 256)
 _NAMES = {False: "fresh", True: "plain cloning"}  # by whether it is cloned
 _WAYS = ("c", "onnx")
-_CALLS, _ROUNDS = 1000, 5
 
 
 def cells(quick: bool) -> list[Cell]:
@@ -72,38 +70,9 @@ def _as_c(result: fdtasil.Distilled, path: Path, env: str, seed: int) -> dict[st
             "c_return": judged.normalized_return,
             "c_ci95": judged.ci95,
             "c_bytes": file.stat().st_size,
-            "c_microseconds": _c_microseconds(file.read_text(), result.student),
-            "onnx_microseconds": _onnx_microseconds(result.export_bytes("student.onnx")),
+            "c_microseconds": c_microseconds(file.read_text(), result.student),
+            "onnx_microseconds": size_of_student(result.student).onnx_microseconds,
         }
-
-
-def _c_microseconds(source: str, student: fdtasil.Student) -> float:
-    function = shared_function(source, "student")
-    seen = np.zeros(student.observation_size, np.float32)
-    done = np.zeros(student.action_size, np.float32)
-    places = seen.ctypes.data, done.ctypes.data
-    return _microseconds(lambda: function(*places))
-
-
-def _onnx_microseconds(data: bytes) -> float:
-    import onnxruntime
-
-    options = onnxruntime.SessionOptions()
-    options.intra_op_num_threads = 1
-    session = onnxruntime.InferenceSession(data, options)
-    (given,) = session.get_inputs()
-    row = {given.name: np.zeros((1, given.shape[1]), np.float32)}
-    return _microseconds(lambda: session.run(None, row))
-
-
-def _microseconds(call: Callable[[], object]) -> float:
-    taken = []
-    for _ in range(_ROUNDS):
-        start = time.perf_counter()
-        for _ in range(_CALLS):
-            call()
-        taken.append((time.perf_counter() - start) / _CALLS)
-    return round(1e6 * min(taken), 2)
 
 
 def draw(rows: Sequence[Row]) -> dict[str, bytes]:

@@ -13,8 +13,8 @@ import fdtasil
 from fdtasil.errors import ExpertError, ExportError, SettingError
 from fdtasil.files.compiled import compiler
 from fdtasil.student.architectures import ACTIVATIONS
-from fdtasil.student.c_int8 import rounded
-from fdtasil.student.c_source import c_source, check_parity
+from fdtasil.student.c_int8 import INT8, rounded
+from fdtasil.student.c_source import FLOAT, c_memory, c_source, check_parity
 from fdtasil.student.exports import export
 from fdtasil.student.plain import PLAIN
 
@@ -97,6 +97,24 @@ def test_eight_bits_take_a_quarter_of_the_flash(tmp_path):
         subprocess.run([compiler(), "-std=c99", "-Os", "-c", "-o", object_, file], check=True)
         sizes.append(object_.stat().st_size)
     assert sizes[0] < 0.32 * sizes[1]
+
+
+@needs_a_compiler
+@pytest.mark.parametrize("hidden", [(), (8,), (40, 24)], ids=str)
+@pytest.mark.parametrize(("name", "layers"), [("student.c", FLOAT), ("student.int8.c", INT8)])
+def test_its_memory_is_what_a_compiler_lays_out(name, layers, hidden, tmp_path):
+    student = make(hidden, "relu")
+    source = export(student, NEAR, {}, name)
+    constants, memory = c_memory(student.plain, layers)
+    assert f"constants: {constants:,} bytes" in source.decode()
+    assert f"memory: {memory:,} bytes" in source.decode()
+    file, object_ = tmp_path / "s.c", tmp_path / "s.o"
+    file.write_bytes(source)
+    subprocess.run([compiler(), "-std=c99", "-O0", "-c", "-o", object_, file], check=True)
+    said = subprocess.run(["nm", "-S", object_], capture_output=True, text=True).stdout
+    sizes = [line.split() for line in said.splitlines() if len(line.split()) == 4]
+    held = {kind: sum(int(size, 16) for _, size, of, _ in sizes if of == kind) for kind in "br"}
+    assert (held["r"], held["b"]) == (constants, memory)
 
 
 @needs_a_compiler
@@ -227,6 +245,7 @@ def test_from_a_shell(quick_folder, inside, tmp_path):
     done = inside("export", quick_folder, out)
     assert done.returncode == 0, done.stderr
     assert f"written: {out}" in done.stdout
+    assert "microseconds here" in done.stdout
     assert "#define STUDENT_OBSERVATIONS 5" in out.read_text()
     expert = mlp_onnx(tmp_path / "e.onnx")
     line = ("evaluate", out, TOY, "--expert", expert, "--episodes", 2, "--horizon", 10)

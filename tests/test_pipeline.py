@@ -101,6 +101,11 @@ def test_the_report_has_what_it_promises(quick_folder):
     promised |= {"ci95", "survival", "action_error", "imitation_gap"}
     assert promised <= set(report["evaluation"])
     assert {"act", "label", "probe"} <= set(report["queries"])
+    student, expert = (report["size"][name] for name in ("student", "expert"))
+    assert student["bytes"] == 4 * student["parameters"] < student["c_constants"]
+    assert all(student[f"{kind}microseconds"] > 0 for kind in ("", "onnx_"))
+    assert student["c_memory"] > 0
+    assert expert["onnx_microseconds"] is expert["c_memory"] is None
 
 
 def test_the_onnx_file_stands_alone(quick, tmp_path):

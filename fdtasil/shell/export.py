@@ -5,7 +5,9 @@ from typing import Annotated
 
 import tyro
 
+from fdtasil.files.compiled import compiler
 from fdtasil.results.distilled import Distilled
+from fdtasil.results.size import c_microseconds
 from fdtasil.shell.command import RunFolder
 
 __all__ = ["command"]
@@ -23,6 +25,10 @@ def command(run: RunFolder, file: OutFile) -> None:
             in eight bits), .h (the header of both) or .py (what answers with numpy alone, from
             the .safetensors).
     """
-    print(f"written: {Distilled.load(run).export(file)}")
+    result = Distilled.load(run)
+    print(f"written: {result.export(file)}")
+    if file.suffix == ".c" and compiler() is not None:
+        taken = c_microseconds(file.read_text(), result.student)
+        print(f"one answer takes {taken:,.3g} microseconds here; the file's comment says the rest")
     if file.suffix == ".py":
         print(f"it opens the weights: fdtasil export {run} {file.with_suffix('.safetensors')}")

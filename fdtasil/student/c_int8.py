@@ -69,5 +69,5 @@ static void linear(const signed char *weights, const float *scales, const float 
     }
 }
 """
-INT8 = Layers(_arrays, _function, 1e-2)
+INT8 = Layers(_arrays, _function, lambda widest: 2 * widest, 1e-2)
 """Eight bits a weight, each output with a scale; sums in 32 bits."""

@@ -10,7 +10,7 @@ from fdtasil.files.compiled import answers_of, compiler
 from fdtasil.student.agreement import check_agreement
 from fdtasil.student.plain import PlainPolicy
 
-__all__ = ["FLOAT", "Layers", "c_header", "c_source", "check_parity"]
+__all__ = ["FLOAT", "Layers", "c_header", "c_memory", "c_source", "check_parity"]
 
 _BEND = {
     "elu": "x > 0.0f ? x : expm1f(x)",
@@ -30,13 +30,15 @@ class Layers:
     Attributes:
         arrays: Number of a layer, (outputs, inputs) weights -> what is written of them, by name:
             the first arguments of the function.
-        function: The widest layer's width -> the C function `linear`.
+        function: The widest input's width -> the C function `linear`.
+        scratch: The same width -> bytes of static memory that this function has.
         agreement: How far compiled answers may be from the policy's, in halves of an action's
             range.
     """
 
     arrays: Callable[[int, np.ndarray], Mapping[str, np.ndarray]]
     function: Callable[[int], str]
+    scratch: Callable[[int], int]
     agreement: float
 
 
@@ -55,6 +57,15 @@ def c_header(policy: PlainPolicy) -> str:
     )
 
 
+def c_memory(policy: PlainPolicy, layers: Layers | None = None) -> tuple[int, int]:
+    """Return how many bytes a student's C file has of constants, and of static memory."""
+    layers = layers or FLOAT
+    constants = sum(array.nbytes for array in _constants(policy, _held(policy, layers)).values())
+    widths = _widths(policy)
+    buffers = len(_buffers(policy)) * max(widths) * np.dtype(np.float32).itemsize
+    return constants, buffers + layers.scratch(max(widths[:-1]))
+
+
 def c_source(policy: PlainPolicy, about: Mapping[str, str], layers: Layers | None = None) -> str:
     """Return the C file of a student, which `-DSTUDENT_MAIN` makes a program of lines.
 
@@ -64,20 +75,15 @@ def c_source(policy: PlainPolicy, about: Mapping[str, str], layers: Layers | Non
         layers: How weights are held; left out, as float32.
     """
     layers = layers or FLOAT
-    widths = [len(policy.mean), *(len(biases) for _, biases in policy.layers)]
-    held = [layers.arrays(number, weights) for number, (weights, _) in enumerate(policy.layers)]
-    arrays: dict[str, np.ndarray] = {"mean": policy.mean, "scale": policy.scale}
-    for number, (_, biases) in enumerate(policy.layers):
-        arrays |= {**held[number], f"b{number}": biases}
-    arrays |= {"bounded": policy.bounded, "centre": policy.centre, "half": policy.half}
-    plain = {name: _plain(array) for name, array in arrays.items()}
+    widths, held = _widths(policy), _held(policy, layers)
+    plain = _constants(policy, held)
     digest = hashlib.sha256(b"".join(array.tobytes() for array in plain.values())).hexdigest()
-    deep, widest = len(policy.layers) > 1, max(widths)
-    buffers = ["first", "second"] if deep else ["first"]
+    buffers, (constants, memory) = _buffers(policy), c_memory(policy, layers)
     comment = {
         **about,
         "layers": " -> ".join(map(str, widths)) + f", {policy.activation}",
-        "constants": f"{sum(array.nbytes for array in plain.values()):,} bytes",
+        "constants": f"{constants:,} bytes",
+        "memory": f"{memory:,} bytes, static",
         "sha256": f"{digest} of the constants",
     }
     lines = "\n".join(f"   {name}: {_plainly(text)}" for name, text in comment.items())
@@ -88,8 +94,8 @@ def c_source(policy: PlainPolicy, about: Mapping[str, str], layers: Layers | Non
             c_header(policy).partition("*/\n")[2],
             "#include <math.h>\n",
             *(_array(name, array) for name, array in plain.items()),
-            *(f"static float {name}[{widest}];\n" for name in buffers),
-            *([_BEND_TEXT.format(_BEND[policy.activation])] if deep else []),
+            *(f"static float {name}[{max(widths)}];\n" for name in buffers),
+            *([_BEND_TEXT.format(_BEND[policy.activation])] if len(held) > 1 else []),
             layers.function(max(widths[:-1])),
             "void student(const float observation[STUDENT_OBSERVATIONS],\n"
             "             float action[STUDENT_ACTIONS])\n{",
@@ -106,6 +112,27 @@ def c_source(policy: PlainPolicy, about: Mapping[str, str], layers: Layers | Non
             _MAIN,
         ]
     )
+
+
+def _widths(policy: PlainPolicy) -> list[int]:
+    return [len(policy.mean), *(len(biases) for _, biases in policy.layers)]
+
+
+def _buffers(policy: PlainPolicy) -> list[str]:
+    """Return the names of those, each as wide as the widest layer, that values pass through."""
+    return ["first", "second"] if len(policy.layers) > 1 else ["first"]
+
+
+def _held(policy: PlainPolicy, layers: Layers) -> list[Mapping[str, np.ndarray]]:
+    return [layers.arrays(number, weights) for number, (weights, _) in enumerate(policy.layers)]
+
+
+def _constants(policy: PlainPolicy, held: list[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    arrays: dict[str, np.ndarray] = {"mean": policy.mean, "scale": policy.scale}
+    for number, (_, biases) in enumerate(policy.layers):
+        arrays |= {**held[number], f"b{number}": biases}
+    arrays |= {"bounded": policy.bounded, "centre": policy.centre, "half": policy.half}
+    return {name: _plain(array) for name, array in arrays.items()}
 
 
 def _plain(array: np.ndarray) -> np.ndarray:
@@ -169,7 +196,9 @@ _LINEAR = """static void linear(const float *weights, const float *biases, const
     }
 }
 """
-FLOAT = Layers(lambda number, weights: {f"w{number}": weights}, lambda widest: _LINEAR, 1e-5)
+FLOAT = Layers(
+    lambda number, weights: {f"w{number}": weights}, lambda widest: _LINEAR, lambda widest: 0, 1e-5
+)
 """Weights as they are."""
 _MAIN = """#ifdef STUDENT_MAIN
 #include <stdio.h>
