@@ -59,6 +59,8 @@ def test_a_loop_that_forgives_in_proportion():
     assert found.constant == pytest.approx(1 / STIFFNESS, rel=0.01)
     assert found.order == 0
     assert found.gamma(0.01) == pytest.approx(0.05, rel=0.02)
+    assert found.rate == pytest.approx(1 - STIFFNESS, rel=1e-3)
+    assert found.reach == 1e-2
 
 
 @pytest.mark.parametrize(("nu", "order"), [(0.5, 1), (1 / 3, 2)])

@@ -3,6 +3,7 @@
 import math
 import types
 from collections.abc import Mapping
+from dataclasses import is_dataclass
 from typing import Annotated, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 __all__ = ["as_kind", "from_plain", "to_plain", "without_infinities"]
@@ -11,8 +12,14 @@ Kind = TypeVar("Kind")
 
 
 def to_plain(instance: object) -> dict[str, Any]:
-    """Return the fields by name; tuples become lists."""
-    return {name: list(v) if isinstance(v, tuple) else v for name, v in vars(instance).items()}
+    """Return the fields by name; tuples become lists, and dataclasses inside what they have."""
+    return {name: _plain(value) for name, value in vars(instance).items()}
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, tuple):
+        return [_plain(one) for one in value]
+    return to_plain(value) if is_dataclass(value) else value
 
 
 def from_plain(kind: type[Kind], fields: Mapping[str, Any]) -> Kind:

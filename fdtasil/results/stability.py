@@ -23,6 +23,7 @@ __all__ = ["Stability", "distances", "stability_of"]
 SIZES = (1e-6, 1e-5, 1e-4, 1e-3, 1e-2, 1e-1)
 _FAR = 0.3  # deviations: farther apart two paths begin to have nothing to do with each other
 _NEAR = 1e-5  # what float32 leaves of a path
+_IMPULSE = 1e-2  # size of the disturbance of a single action
 _RESAMPLES = 500
 _HIGHEST = 9  # order beyond which nobody asks
 _NEARLY = 0.05  # of an order: a measured exponent of 0.97 is one
@@ -39,6 +40,9 @@ class Stability:
         constant: C; None where too few deviations are between rounding and one deviation.
         exponent: nu; None with it. 1 is a loop that forgives in proportion.
         interval: 95 % bootstrap interval of the exponent over episodes.
+        reach: Largest disturbance that the law was fitted to; None with it.
+        rate: By what the deviation changes in each step after a single action was disturbed, by a
+            fitted exponential; None where it is rounding, or as large as the states vary, at once.
     """
 
     sizes: tuple[float, ...]
@@ -46,6 +50,8 @@ class Stability:
     constant: float | None
     exponent: float | None
     interval: tuple[float, float] | None
+    reach: float | None = None
+    rate: float | None = None
 
     @property
     def order(self) -> int | None:
@@ -88,23 +94,27 @@ def stability_of(
     normal = np.stack([random.standard_normal(m) for random in noise])
     directions = normal / np.linalg.norm(normal, axis=1, keepdims=True)
     seeds, found = [int(seed) for seed in own.seeds], []
-    for size in sizes:
+    for size in (*sizes, _IMPULSE):
         # Episodes are told apart by their generators, which are handed to whoever acts.
         marks = [np.random.default_rng(seed) for seed in seeds]
         offsets = dict(zip(map(id, marks), size * directions * units, strict=True))
-        episodes = rollout(_disturbed(expert, offsets), pool, seeds, horizon, marks)
-        found.append(distances(own, episodes, scales))
-    measured = np.stack(found)
-    constant, exponent, interval = _fitted(np.asarray(sizes), measured)
+        lasting = len(found) < len(sizes)
+        episodes = rollout(_disturbed(expert, offsets, lasting), pool, seeds, horizon, marks)
+        found.append(_apart(own, episodes, scales))
+    *lasted, impulse = found
+    measured = np.stack([apart.max(axis=1) for apart in lasted])
     means = tuple(float(value) for value in measured.mean(axis=1))
-    return Stability(tuple(sizes), means, constant, exponent, interval)
+    return Stability(tuple(sizes), means, *_fitted(np.asarray(sizes), measured), _rate(impulse))
 
 
-def _disturbed(expert: Expert, offsets: Mapping[int, np.ndarray]) -> Behaviour:
-    """Return the expert with an offset for each generator, by its id."""
+def _disturbed(expert: Expert, offsets: Mapping[int, np.ndarray], lasting: bool) -> Behaviour:
+    """Return the expert with an offset for each generator, by its id; lasting, or of one step."""
+    left = dict(offsets)
 
     def act(observations: np.ndarray, noise: Sequence[np.random.Generator]) -> Decision:
-        added = np.stack([offsets[id(random)] for random in noise])
+        added = np.stack([left[id(random)] for random in noise])
+        if not lasting:
+            left.update((id(random), np.zeros_like(added[0])) for random in noise)
         answers = expert.ask(observations, "evaluate") + added
         return Decision(answers.astype(np.float32), None)
 
@@ -113,19 +123,35 @@ def _disturbed(expert: Expert, offsets: Mapping[int, np.ndarray]) -> Behaviour:
 
 def distances(expert: Episodes, other: Episodes, scales: Scales) -> np.ndarray:
     """Return (E,) the largest distance of two paths while both last, in deviations."""
+    return _apart(expert, other, scales).max(axis=1)
+
+
+def _apart(expert: Episodes, other: Episodes, scales: Scales) -> np.ndarray:
+    """Return (E, T) the distance of two paths, in deviations; 0 where one has ended."""
     both, live = expert.valid & other.valid, scales.live
     apart = (other.observations - expert.observations)[..., live] / scales.deviation[live]
-    return np.where(both, np.sqrt((apart.astype(np.float64) ** 2).mean(axis=-1)), 0.0).max(axis=1)
+    return np.where(both, np.sqrt((apart.astype(np.float64) ** 2).mean(axis=-1)), 0.0)
+
+
+def _rate(apart: np.ndarray) -> float | None:
+    """Return the factor of a step, from (E, T) distances after the first action was disturbed."""
+    means = apart.mean(axis=0)[1:]
+    outside = np.flatnonzero((means <= _NEAR) | (means >= _FAR))
+    means = means[: outside[0]] if outside.size else means
+    if len(means) < 3:
+        return None
+    slope, _ = np.polyfit(np.arange(len(means)), np.log(means), 1)
+    return float(np.exp(slope))
 
 
 def _fitted(
     sizes: np.ndarray, measured: np.ndarray
-) -> tuple[float | None, float | None, tuple[float, float] | None]:
+) -> tuple[float | None, float | None, tuple[float, float] | None, float | None]:
     """Fit a power law to the sizes whose deviations are neither rounding nor chaos."""
     means = measured.mean(axis=1)
     kept = (means > _NEAR) & (means < _FAR)
     if kept.sum() < 3:
-        return None, None, None
+        return None, None, None, None
     constant, exponent = _law(sizes[kept], means[kept])
     random, episodes = np.random.default_rng(0), measured.shape[1]
     drawn = [
@@ -133,7 +159,7 @@ def _fitted(
         for _ in range(_RESAMPLES)
     ]
     low, high = np.percentile([law[1] for law in drawn], [2.5, 97.5])
-    return constant, exponent, (float(low), float(high))
+    return constant, exponent, (float(low), float(high)), float(sizes[kept].max())
 
 
 def _law(sizes: np.ndarray, deviations: np.ndarray) -> tuple[float, float]:

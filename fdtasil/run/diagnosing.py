@@ -14,6 +14,7 @@ from fdtasil.experts.load import ExpertLike, expert_in, sized
 from fdtasil.files.plain import to_plain
 from fdtasil.probes.scales import measure_scales
 from fdtasil.progress import Progress
+from fdtasil.results.conditions import Condition, Errors, conditions_of, errors_of
 from fdtasil.results.fidelity import Fidelity, fidelity_of
 from fdtasil.results.linearisation import Linearisation, linearise
 from fdtasil.results.stability import Stability, distances, stability_of
@@ -33,6 +34,7 @@ from fdtasil.student.view import View
 __all__ = ["Diagnosis", "diagnose"]
 
 _STATES = 64
+_NORMED = 16  # whose whole derivative is measured
 _LOOKED = 4  # episodes whose loop is linearised, at three states each
 
 
@@ -51,6 +53,11 @@ class Diagnosis:
         queries: Rows that the expert answered.
         linearisation: Eigenvalues of both closed loops along the expert's path; None where the
             environment is no MuJoCo environment of gymnasium.
+        errors: The student's action and derivative at states of the expert's disturbed part, as
+            the theorems ask for; None where the expert has no answer around them, or more than
+            1,000 coordinates move.
+        conditions: TaSIL's statements that are about such a loop, with these constants; none where
+            no law was found.
     """
 
     fidelity: Fidelity
@@ -60,6 +67,8 @@ class Diagnosis:
     gap: float
     queries: int
     linearisation: Linearisation | None = None
+    errors: Errors | None = None
+    conditions: tuple[Condition, ...] = ()
 
     def to_json(self) -> dict[str, Any]:
         """Return the diagnosis as plain JSON values."""
@@ -83,11 +92,18 @@ class Diagnosis:
                 f"  gamma(e) = {loop.constant:.2g} * e^{loop.exponent:.2f} [{low:.2f}, {high:.2f}]"
                 f"; order that theorem 3.2 asks for: {order}"
             )
+        if loop.rate is not None:
+            lines.append(f"  after one disturbed action: times {loop.rate:.3g} in each step")
         law = "no law, no bound" if self.bound is None else f"at most {self.bound:.2g} by that law"
         lines.append(f"the student's largest error on its own path: {self.largest_error:.2g}")
         lines.append(f"its distance to the expert's path: {self.gap:.2g} deviations ({law})")
         if self.linearisation is not None:
             lines.append(f"linearised loops: {self.linearisation}")
+        if self.errors is not None:
+            lines.append(f"on the expert's path: {self.errors}")
+        if self.conditions:
+            lines.append("TaSIL's conditions with these constants, which are lower bounds")
+            lines += [f"  {condition}" for condition in self.conditions]
         return "\n".join(lines)
 
 
@@ -174,6 +190,8 @@ def diagnose(
         looked = sorted({0, short // 2, short - 1})
         with simulator_warnings():
             loops = linearise(pool, asked.policy("evaluate"), act, starts[:_LOOKED], looked)
+        spread, asking = first.spread(_NORMED), generator(seed, "directions of the theorems")
+        errors_there = errors_of(act, asked, spread, units, scales, asking, held)
         return Diagnosis(
             fidelity,
             stability,
@@ -182,4 +200,6 @@ def diagnose(
             gap,
             sum(asked.queries.values()),
             loops,
+            errors_there,
+            () if errors_there is None else conditions_of(errors_there, stability),
         )
