@@ -59,21 +59,22 @@ Results = Mapping[int, Mapping[str, Any]]  # by seed
 
 
 def _line(rows: Sequence[Row], head: list[str]) -> list[list[str]]:
-    """Return the line of an expert and budget, or none where two seeds are not there yet."""
+    """Return the line of an expert and budget, or none where no way has two seeds yet."""
     found = {
         probes: {
             row["cell"]["seed"]: row["result"] for row in rows if row["cell"]["probes"] == probes
         }
         for probes in PROBES
     }
-    if len(found[STORED].keys() & found[PLAIN].keys()) < 2:
+    if all(len(results) < 2 for results in found.values()):
         return []
     line = [*head, *(_score_text(found[probes]) for probes in reversed(PROBES))]
     pairs = ((FRESH, STORED), (FRESH, PLAIN), (STORED, PLAIN))
     line += [_difference_text(found[ours], found[theirs]) for ours, theirs in pairs]
     asked = (STORED, FRESH)
     line.append(", ".join(_text(min, found[probes], "normalized_return") for probes in asked))
-    lasts = [_text(mean, found[STORED], "expert_survival")]
+    # Equal seeds, equal starts: the expert's own survival is any way's.
+    lasts = [_text(mean, max(found.values(), key=len), "expert_survival")]
     lasts += [_text(mean, found[probes], "survival") for probes in asked]
     seconds = [_text(mean, found[probes], "train_seconds", 0) for probes in asked]
     return [[*line, ", ".join(lasts), ", ".join(seconds)]]

@@ -62,9 +62,10 @@ def test_the_command_and_the_card_of_a_folder(quick_folder, inside, tmp_path):
     assert "## How good" in card
 
 
-def test_the_call_of_the_card_repeats_the_run(tmp_path, linear):
+@pytest.mark.parametrize("further", [{}, {"history": 2}], ids=str)
+def test_the_call_of_the_card_repeats_the_run(further, linear):
     """With an expert of its own: a function has no path."""
-    result = fdtasil.distill(linear, TOY, 3, **QUICK)
+    result = fdtasil.distill(linear, TOY, 3, **QUICK, **further)
     block = re.search(r"```python\n(.*?)```", card_of(result), re.S)[1]
     code = block.replace(repr(result.settings["expert"]), "expert").replace(
         repr(result.settings["env"]), "env"

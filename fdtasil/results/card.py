@@ -47,7 +47,7 @@ def card_of(result: Any) -> str:
             "`report.json`, `figures/`. A whole run also has `demonstrations.npz`, `config.json` "
             "and `progress.csv`.\n",
             "## Again\n",
-            f"```python\n{call_of(result.settings)}```\n",
+            f"```python\n{call_of(result.settings, result.steps_seen)}```\n",
         ]
     )
 

@@ -44,7 +44,7 @@ def page_of(result: Any) -> str:
         else f"<h2>Evaluation</h2>{rows_html(evaluation_rows(evaluation))}",
         f"<h2>How it came to be</h2>{rows_html(run_rows(report))}",
         *(f"<h2>{name.capitalize()}</h2>{picture}" for name, picture in _pictures(result)),
-        f"<h2>Again</h2><pre>{escape(call_of(result.settings))}</pre>",
+        f"<h2>Again</h2><pre>{escape(call_of(result.settings, result.steps_seen))}</pre>",
         f"<h2>Settings</h2><pre>{escape(json.dumps(result.settings, indent=1))}</pre>",
     ]
     title = escape(f"fdtasil: {report['env']}")

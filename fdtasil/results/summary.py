@@ -40,10 +40,14 @@ def run_rows(report: Mapping[str, Any]) -> Rows:
     return rows
 
 
-def call_of(settings: Mapping[str, Any]) -> str:
+def call_of(settings: Mapping[str, Any], history: int) -> str:
     """Return the call of a run, as far as its settings say it.
 
     What an expert, an environment or a dataset is made with, and functions, stand in no file.
+
+    Args:
+        settings: Of the run's configuration.
+        history: How many observations the student sees.
     """
     given = [repr(settings["expert"]), repr(settings["env"])]
     probes = settings["probes"]
@@ -57,8 +61,8 @@ def call_of(settings: Mapping[str, Any]) -> str:
         given.append(f"keep={settings['keep']!r}")
     if settings.get("spread"):
         given.append(f"spread={settings['spread']!r}")
-    if settings.get("past"):
-        given.append("history=...")
+    if history > 1:
+        given.append(f"history={history}")
     given.append(f"evaluation_episodes={settings['evaluation_episodes']}")
     student = dict(settings["student"])
     if "architecture" not in student:
