@@ -12,7 +12,7 @@ from fdtasil.run.presets import preset_of
 __all__ = ["HORIZON", "STEPS", "call_of", "distil", "distillations", "usual_arguments"]
 
 HORIZON = 300
-STEPS = 4_000  # of all, however much data they have: none is trained longer than another
+STEPS = 4_000  # however much data there is; a method that has others says so
 
 
 def distillations(
@@ -40,7 +40,7 @@ def distillations(
 
 
 def usual_arguments(cell: Cell, method: Mapping[str, Any]) -> dict[str, Any]:
-    """Return a cell's expert, trajectories and seed, at a horizon and steps that all share.
+    """Return a cell's expert, trajectories and seed, at the usual horizon and steps.
 
     Args:
         cell: With these three names.

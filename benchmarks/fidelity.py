@@ -48,6 +48,10 @@ def run(cell: Cell, device: str) -> dict[str, Any]:
         "bound": found.bound,
         "gap": found.gap,
         "order": found.stability.order,
+        "errors": None if found.errors is None else vars(found.errors),
+        "conditions": [
+            {"source": one.source, "asked": one.asked, "met": one.met} for one in found.conditions
+        ],
     }
 
 
@@ -57,9 +61,10 @@ def draw(rows: Sequence[Row]) -> dict[str, bytes]:
     heads = ["expert", *(f"{name}: return, derivatives, actions" for name in STUDENTS)]
     heads += [f"rank correlation of return and {name}" for name in ERRORS]
     heads += ["distance to the expert's path after 25 steps: bounded, measured"]
+    heads += ["derivative of the difference: measured, allowed by the corollary"]
     lines = [_line(e, [row for row in rows if row["cell"]["expert"] == e]) for e in experts]
     if len(experts) > 1:
-        lines.append(["all", *[""] * len(STUDENTS), *_agreements(rows), ""])
+        lines.append(["all", *[""] * len(STUDENTS), *_agreements(rows), "", ""])
     return {"fidelity.md": table(heads, lines).encode()}
 
 
@@ -70,7 +75,7 @@ def _line(expert: str, rows: Sequence[Row]) -> list[str]:
         names = ("normalized_return", *ERRORS) if found else ()
         means = (sum(one[name] for one in found) / len(found) for name in names)
         cells.append(", ".join(f"{mean:.2f}" for mean in means) or "-")
-    return [expert, *cells, *_agreements(rows), _distances(rows)]
+    return [expert, *cells, *_agreements(rows), _distances(rows), _derivatives(rows)]
 
 
 def _distances(rows: Sequence[Row]) -> str:
@@ -81,6 +86,23 @@ def _distances(rows: Sequence[Row]) -> str:
         return "-"
     bound = f"{sum(bounds) / len(bounds):.3g}" if bounds else "no law"
     return f"{bound}, {sum(one['gap'] for one in good) / len(good):.2g}"
+
+
+def _derivatives(rows: Sequence[Row]) -> str:
+    """Return |dDelta| of the good students, and what the corollary for r = 1 allows."""
+    found = [
+        (measured, allowed)
+        for row in rows
+        if row["cell"]["student"] == "good"
+        for one in row["result"].get("conditions", ())
+        if one["source"].startswith("corollary")
+        for name, measured, allowed in one["asked"]
+        if name == "|dDelta|"
+    ]
+    if not found:
+        return "-"
+    measured, allowed = (sum(values) / len(values) for values in zip(*found, strict=True))
+    return f"{measured:.3g}, {allowed:.2g}"
 
 
 def _agreements(rows: Sequence[Row]) -> list[str]:

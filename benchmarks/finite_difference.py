@@ -39,7 +39,7 @@ METHODS: dict[str, dict[str, dict[str, Any]]] = {
 }
 # The appendix's claims, and the baseline: ours - theirs on equal seeds.
 PAIRS = (("1", "jacobian"), ("10", "jacobian"), ("10", "1"), ("50", "1"), ("10", "augmentation"))
-# What these experts get by default, beside the design of the paper.
+# What these experts get by default, for three times the steps, beside the design of the paper.
 FRESH_PAIRS = {"standard": (("fresh", "10"), ("fresh", "jacobian")), "paper": ()}
 
 

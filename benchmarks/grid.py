@@ -27,7 +27,7 @@ _LABELS = {
     "jacobian": "analytic Jacobian",
     "1": "1 probe",
     "augmentation": "10 answers as labels",
-    "fresh": "fresh queries",
+    "fresh": "fresh queries, longer training",
 }
 
 

@@ -13,7 +13,7 @@ from benchmarks.distillation import HORIZON
 from benchmarks.grid import SEEDS
 from benchmarks.panels import draw_panels
 from benchmarks.runner import Benchmark, Cell, Row
-from benchmarks.statistics import interval_text
+from benchmarks.statistics import difference_text, interval_text, paired_difference
 from benchmarks.tables import table
 from fdtasil.results.size import c_microseconds, size_of_student
 
@@ -85,6 +85,7 @@ def draw(rows: Sequence[Row]) -> dict[str, bytes]:
     found = {expert: results for expert, results in found.items() if len(results) > 1}
     heads = ["expert", "smallest of each seed", "bytes at most", "its C code in the loop"]
     heads += ["microseconds as C, in onnxruntime", "smallest cloned"]
+    heads += ["fresh 32 x 32 - cloned 256 x 256"]
     small = table(heads, [_smallest(expert, results) for expert, results in found.items()])
     every = table(["expert", "", *(f"{w} x {w}" for w in WIDTHS)], _every(found))
     curves = {
@@ -113,7 +114,15 @@ def _smallest(expert: str, results: Sequence[Any]) -> list[str]:
         if there
         else "-",
         _widths([_first(result, cloned=True) for result in results]),
+        _headline(results),
     ]
+
+
+def _headline(results: Sequence[Any]) -> str:
+    """Return the mean difference of a small student with queries and a large cloned one."""
+    curves = _curves(results)
+    small, large = curves["fresh"][32], curves["plain cloning"][256]
+    return difference_text(*paired_difference(dict(enumerate(small)), dict(enumerate(large))))
 
 
 def _first(result: Any, *, cloned: bool) -> Any:

@@ -42,9 +42,9 @@ def rest(rows):
     return np.zeros((len(rows), 1), np.float32)
 
 
-def measured(nu, sizes, horizon):
+def measured(nu, sizes, horizon, system=PowerLaw):
     """In units of the state itself."""
-    with EnvironmentPool(lambda: PowerLaw(nu)) as pool:
+    with EnvironmentPool(lambda: system(nu)) as pool:
         expert = load_expert(rest, 1, 1)
         own = rollout(follow(expert.policy("act")), pool, range(6), horizon)
         scales = measure_scales(np.array([[-1.0], [1.0]]))
@@ -60,7 +60,23 @@ def test_a_loop_that_forgives_in_proportion():
     assert found.order == 0
     assert found.gamma(0.01) == pytest.approx(0.05, rel=0.02)
     assert found.rate == pytest.approx(1 - STIFFNESS, rel=1e-3)
-    assert found.reach == 1e-2
+    assert found.reach == (1e-3, 1e-2)
+
+
+def test_an_episode_that_ends_does_not_look_like_recovery():
+    """All deviations stay as they are: x' = x + u. Half of the episodes end after ten steps."""
+
+    class Ending(PowerLaw):
+        def step(self, action):
+            self.x, self.done = self.x + action, self.done + 1
+            return self.x.copy(), 1.0, bool(self.start > 0 and self.done == 10), False, {}
+
+        def reset(self, *, seed=None, options=None):
+            seen, info = super().reset(seed=seed)
+            self.start, self.done = seen[0], 0
+            return seen, info
+
+    assert measured(1.0, (1e-3, 3e-3, 1e-2), 40, Ending).rate == pytest.approx(1, abs=1e-4)
 
 
 @pytest.mark.parametrize(("nu", "order"), [(0.5, 1), (1 / 3, 2)])

@@ -40,9 +40,10 @@ class Stability:
         constant: C; None where too few deviations are between rounding and one deviation.
         exponent: nu; None with it. 1 is a loop that forgives in proportion.
         interval: 95 % bootstrap interval of the exponent over episodes.
-        reach: Largest disturbance that the law was fitted to; None with it.
+        reach: Smallest and largest disturbance that the law was fitted to; None with it.
         rate: By what the deviation changes in each step after a single action was disturbed, by a
-            fitted exponential; None where it is rounding, or as large as the states vary, at once.
+            fitted exponential; None where it is rounding, or as large as the states vary, at once,
+            or where an episode ends.
     """
 
     sizes: tuple[float, ...]
@@ -50,7 +51,7 @@ class Stability:
     constant: float | None
     exponent: float | None
     interval: tuple[float, float] | None
-    reach: float | None = None
+    reach: tuple[float, float] | None = None
     rate: float | None = None
 
     @property
@@ -102,7 +103,7 @@ def stability_of(
         episodes = rollout(_disturbed(expert, offsets, lasting), pool, seeds, horizon, marks)
         found.append(_apart(own, episodes, scales))
     *lasted, impulse = found
-    measured = np.stack([apart.max(axis=1) for apart in lasted])
+    measured = np.stack([_farthest(apart) for apart in lasted])
     means = tuple(float(value) for value in measured.mean(axis=1))
     return Stability(tuple(sizes), means, *_fitted(np.asarray(sizes), measured), _rate(impulse))
 
@@ -123,20 +124,24 @@ def _disturbed(expert: Expert, offsets: Mapping[int, np.ndarray], lasting: bool)
 
 def distances(expert: Episodes, other: Episodes, scales: Scales) -> np.ndarray:
     """Return (E,) the largest distance of two paths while both last, in deviations."""
-    return _apart(expert, other, scales).max(axis=1)
+    return _farthest(_apart(expert, other, scales))
+
+
+def _farthest(apart: np.ndarray) -> np.ndarray:
+    return np.where(np.isnan(apart), 0.0, apart).max(axis=1)
 
 
 def _apart(expert: Episodes, other: Episodes, scales: Scales) -> np.ndarray:
-    """Return (E, T) the distance of two paths, in deviations; 0 where one has ended."""
+    """Return (E, T) the distance of two paths, in deviations; NaN where one has ended."""
     both, live = expert.valid & other.valid, scales.live
     apart = (other.observations - expert.observations)[..., live] / scales.deviation[live]
-    return np.where(both, np.sqrt((apart.astype(np.float64) ** 2).mean(axis=-1)), 0.0)
+    return np.where(both, np.sqrt((apart.astype(np.float64) ** 2).mean(axis=-1)), np.nan)
 
 
 def _rate(apart: np.ndarray) -> float | None:
     """Return the factor of a step, from (E, T) distances after the first action was disturbed."""
     means = apart.mean(axis=0)[1:]
-    outside = np.flatnonzero((means <= _NEAR) | (means >= _FAR))
+    outside = np.flatnonzero(~((means > _NEAR) & (means < _FAR)))
     means = means[: outside[0]] if outside.size else means
     if len(means) < 3:
         return None
@@ -146,7 +151,7 @@ def _rate(apart: np.ndarray) -> float | None:
 
 def _fitted(
     sizes: np.ndarray, measured: np.ndarray
-) -> tuple[float | None, float | None, tuple[float, float] | None, float | None]:
+) -> tuple[float | None, float | None, tuple[float, float] | None, tuple[float, float] | None]:
     """Fit a power law to the sizes whose deviations are neither rounding nor chaos."""
     means = measured.mean(axis=1)
     kept = (means > _NEAR) & (means < _FAR)
@@ -159,7 +164,12 @@ def _fitted(
         for _ in range(_RESAMPLES)
     ]
     low, high = np.percentile([law[1] for law in drawn], [2.5, 97.5])
-    return constant, exponent, (float(low), float(high)), float(sizes[kept].max())
+    return (
+        constant,
+        exponent,
+        (float(low), float(high)),
+        (float(sizes[kept].min()), float(sizes[kept].max())),
+    )
 
 
 def _law(sizes: np.ndarray, deviations: np.ndarray) -> tuple[float, float]:

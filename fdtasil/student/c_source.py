@@ -60,10 +60,7 @@ def c_header(policy: PlainPolicy) -> str:
 def c_memory(policy: PlainPolicy, layers: Layers | None = None) -> tuple[int, int]:
     """Return how many bytes a student's C file has of constants, and of static memory."""
     layers = layers or FLOAT
-    constants = sum(array.nbytes for array in _constants(policy, _held(policy, layers)).values())
-    widths = _widths(policy)
-    buffers = len(_buffers(policy)) * max(widths) * np.dtype(np.float32).itemsize
-    return constants, buffers + layers.scratch(max(widths[:-1]))
+    return _memory(policy, _constants(policy, _held(policy, layers)), layers)
 
 
 def c_source(policy: PlainPolicy, about: Mapping[str, str], layers: Layers | None = None) -> str:
@@ -78,7 +75,7 @@ def c_source(policy: PlainPolicy, about: Mapping[str, str], layers: Layers | Non
     widths, held = _widths(policy), _held(policy, layers)
     plain = _constants(policy, held)
     digest = hashlib.sha256(b"".join(array.tobytes() for array in plain.values())).hexdigest()
-    buffers, (constants, memory) = _buffers(policy), c_memory(policy, layers)
+    buffers, (constants, memory) = _buffers(policy), _memory(policy, plain, layers)
     comment = {
         **about,
         "layers": " -> ".join(map(str, widths)) + f", {policy.activation}",
@@ -133,6 +130,15 @@ def _constants(policy: PlainPolicy, held: list[Mapping[str, np.ndarray]]) -> dic
         arrays |= {**held[number], f"b{number}": biases}
     arrays |= {"bounded": policy.bounded, "centre": policy.centre, "half": policy.half}
     return {name: _plain(array) for name, array in arrays.items()}
+
+
+def _memory(
+    policy: PlainPolicy, constants: Mapping[str, np.ndarray], layers: Layers
+) -> tuple[int, int]:
+    widths = _widths(policy)
+    buffers = len(_buffers(policy)) * max(widths) * np.dtype(np.float32).itemsize
+    held = sum(array.nbytes for array in constants.values())
+    return held, buffers + layers.scratch(max(widths[:-1]))
 
 
 def _plain(array: np.ndarray) -> np.ndarray:
