@@ -35,7 +35,7 @@ class Fit:
 
     Attributes:
         steps: Gradient steps of a round. Left out, 4,000 where answers are stored, and 12,000
-            where the expert is asked anew. Above 1,500 states, or 13,500 where it is asked anew,
+            where the expert is asked anew. Above 1,500 states, or 5,000 where it is asked anew,
             they grow with the square root of the number of states.
         epochs: Visits of each state in a round, instead of steps.
         batch_size: States in a minibatch at most; an epoch's are of almost equal size.

@@ -51,6 +51,6 @@ class Schedule:
 USUAL = Schedule(4_000, None, 1_500, batch_size=100, learning_rate=1e-3)
 """Where nobody says another."""
 
-ANEW = Schedule(12_000, None, 13_500, batch_size=100, learning_rate=4e-3)
+ANEW = Schedule(12_000, None, 5_000, batch_size=100, learning_rate=4e-3)
 """Where the expert is asked anew: what is never seen twice is not learnt by heart, so that longer
 and faster training goes on teaching."""
