@@ -241,6 +241,12 @@ FAULTS = {
         224: "a run with a memory or a history, learnt from as if it had none",
         225: "a fetched expert that is another file than the manifest says",
     },
+    "what a diagnosis measures": {
+        226: "an episode that ended, which looks like recovery",
+        227: "a law that bends along no single coordinate",
+        228: "actions that differ, and are the same to the environment",
+        229: "a student without an answer, which would meet every condition",
+    },
 }
 
 LEFT_OUT: dict[int, str] = {}

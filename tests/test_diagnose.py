@@ -63,6 +63,7 @@ def test_a_loop_that_forgives_in_proportion():
     assert found.reach == (1e-3, 1e-2)
 
 
+@pytest.mark.fault(226)
 def test_an_episode_that_ends_does_not_look_like_recovery():
     """All deviations stay as they are: x' = x + u. Half of the episodes end after ten steps."""
 
