@@ -102,7 +102,7 @@ class Diagnosis:
         if self.errors is not None:
             lines.append(f"on the expert's path: {self.errors}")
         if self.conditions:
-            lines.append("TaSIL's conditions with these constants, which are lower bounds")
+            lines.append("TaSIL's conditions with these constants, measured at a few states")
             lines += [f"  {condition}" for condition in self.conditions]
         return "\n".join(lines)
 
