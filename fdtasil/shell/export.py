@@ -6,6 +6,7 @@ from typing import Annotated
 import tyro
 
 from fdtasil.files.compiled import compiler
+from fdtasil.files.storage import write_bytes
 from fdtasil.results.distilled import Distilled
 from fdtasil.results.size import c_microseconds
 from fdtasil.shell.command import RunFolder
@@ -26,9 +27,11 @@ def command(run: RunFolder, file: OutFile) -> None:
             the .safetensors).
     """
     result = Distilled.load(run)
-    print(f"written: {result.export(file)}")
+    data = result.export_bytes(file)
+    write_bytes(file, data)
+    print(f"written: {file}")
     if file.suffix == ".c" and compiler() is not None:
-        taken = c_microseconds(file.read_text(), result.student)
+        taken = c_microseconds(data.decode(), result.student)
         print(f"one answer takes {taken:,.3g} microseconds here; the file's comment says the rest")
     if file.suffix == ".py":
         print(f"it opens the weights: fdtasil export {run} {file.with_suffix('.safetensors')}")
