@@ -1021,11 +1021,10 @@ import os, time
 from pathlib import Path
 from fdtasil.files.lock import locked
 with locked(Path({str(tmp_path / "run")!r})):
-    child = os.fork()
-    if child == 0:
+    if os.fork() == 0:
+        print(os.getpid(), flush=True)  # by the child, which then has let go
         time.sleep(60)
         os._exit(0)
-    print(child, flush=True)
     os._exit(1)  # killed
 """
     done = subprocess.Popen([sys.executable, "-c", code], stdout=subprocess.PIPE, text=True)
