@@ -253,5 +253,4 @@ def test_actions_are_compared_as_the_environment_takes_them():
     clipped = lambda rows: np.clip(loud(rows), -1, 1)  # noqa: E731
     found = fdtasil.diagnose(loud, clipped, TOY, episodes=2, horizon=30, progress=False)
     assert found.gap == found.largest_error == 0
-    if found.errors is not None:
-        assert found.errors.action == found.errors.derivative == 0
+    assert found.errors.action == found.errors.derivative == 0
