@@ -94,16 +94,17 @@ def stability_of(
     m = len(units)
     normal = np.stack([random.standard_normal(m) for random in noise])
     directions = normal / np.linalg.norm(normal, axis=1, keepdims=True)
-    seeds, found = [int(seed) for seed in own.seeds], []
-    for size in (*sizes, _IMPULSE):
+    seeds = [int(seed) for seed in own.seeds]
+
+    def followed(size: float, *, lasting: bool) -> np.ndarray:
         # Episodes are told apart by their generators, which are handed to whoever acts.
         marks = [np.random.default_rng(seed) for seed in seeds]
         offsets = dict(zip(map(id, marks), size * directions * units, strict=True))
-        lasting = len(found) < len(sizes)
         episodes = rollout(_disturbed(expert, offsets, lasting), pool, seeds, horizon, marks)
-        found.append(_apart(own, episodes, scales))
-    *lasted, impulse = found
-    measured = np.stack([_farthest(apart) for apart in lasted])
+        return _apart(own, episodes, scales)
+
+    measured = np.stack([_farthest(followed(size, lasting=True)) for size in sizes])
+    impulse = followed(_IMPULSE, lasting=False)
     means = tuple(float(value) for value in measured.mean(axis=1))
     return Stability(tuple(sizes), means, *_fitted(np.asarray(sizes), measured), _rate(impulse))
 
