@@ -10,9 +10,10 @@ from fdtasil.experts.load import load_expert
 from fdtasil.probes.answers import ask_probes
 from fdtasil.probes.scales import measure_scales
 from fdtasil.probes.source import Probes
+from fdtasil.probes.stencils import EXACT
 from fdtasil.probes.surroundings import Surroundings
 from fdtasil.run.presets import PRESETS
-from fdtasil.student.architectures import Mlp
+from fdtasil.student.architectures import ACTIVATIONS, Mlp
 from fdtasil.student.fit import Fit
 from fdtasil.student.loss import Minibatch, ProbeBatch, Weights, taylor_loss
 from fdtasil.student.policy import Student
@@ -84,6 +85,31 @@ def test_the_analytic_loss_and_gradient_agree_with_the_differences(states):
     (fd_loss, fd_gradient), (loss, gradient) = found.values()
     assert float(abs(fd_loss - loss) / loss) < 1e-3
     assert float((fd_gradient - gradient).norm() / gradient.norm()) < 1e-3
+
+
+@pytest.mark.filterwarnings("error")  # a derivative that has no batched form is slow, and warns
+@pytest.mark.parametrize("activation", ACTIVATIONS)
+def test_a_jacobian_by_rows_and_by_columns_is_one_loss(activation):
+    """Of four actions: six directions at once go by its rows, each alone by its columns."""
+    random = torch.Generator().manual_seed(5)
+    student = Mlp((8, 8), activation).build(6, 4, random)
+    state, along, slopes, labels = (
+        torch.randn(1, *shape, generator=random) for shape in ((6,), (6, 6), (6, 1, 4), (4,))
+    )
+
+    def squares(part):
+        """Return the squared error of the derivatives along these directions, and its gradient."""
+        around = ProbeBatch(along[:, part], slopes[:, part], torch.ones(1, len(along[0, part])))
+        found = taylor_loss(student, Minibatch(state, labels, around), EXACT, Weights(1.0))
+        total = found.derivative_error**2 * len(along[0, part])
+        parameters = [p for p in student.parameters() if p.shape != (4,)]  # but the last bias
+        gradient = torch.autograd.grad(total, parameters)
+        return total.detach(), torch.cat([part.flatten() for part in gradient])
+
+    total, gradient = squares(slice(None))
+    alone = [squares(slice(number, number + 1)) for number in range(6)]
+    assert float(total) == pytest.approx(float(sum(part for part, _ in alone)), rel=1e-5)
+    torch.testing.assert_close(gradient, sum(part for _, part in alone), rtol=1e-4, atol=1e-5)
 
 
 def test_a_linear_difference_is_the_exact_derivative(states):

@@ -173,17 +173,31 @@ def _asked_errors(
 def _exact_errors(
     student: nn.Module, batch: Minibatch, probes: ProbeBatch, stencil: Stencil, weights: Weights
 ) -> _Errors:
-    (_, count, _), values = probes.displacements.shape, probes.values
-    second = weights.curvature is not None
-    states = batch.observations.repeat_interleave(count, dim=0)
-    along = _second_derivative_along if second else _derivative_along
-    answers, *derivatives = along(student, states, probes.displacements.flatten(0, 1))
-    action_error = answers[::count] - batch.actions
-    errors = [
-        derivative.reshape(values[:, :, 0].shape) - values[:, :, order]
-        for order, derivative in enumerate(derivatives)
-    ]
+    directions, values = probes.displacements, probes.values
+    count, actions = directions.shape[1], batch.actions.shape[1]
+    # A direction costs three rows of the network and their gradient, a row of the Jacobian one.
+    if weights.curvature is None and 2 * count > actions:
+        answers, jacobian = _jacobian(student, batch.observations)
+        derivatives = [torch.einsum("mbn,bkn->bkm", jacobian, directions)]
+    else:
+        along = _derivative_along if weights.curvature is None else _second_derivative_along
+        states = batch.observations.repeat_interleave(count, dim=0)
+        answers, *flat = along(student, states, directions.flatten(0, 1))
+        answers, derivatives = answers[::count], [d.unflatten(0, (-1, count)) for d in flat]
+    action_error = answers - batch.actions
+    errors = [found - values[:, :, order] for order, found in enumerate(derivatives)]
     return _Errors(action_error, action_error, errors[0], errors[-1])
+
+
+def _jacobian(student: nn.Module, states: Tensor) -> tuple[Tensor, Tensor]:
+    """Return f(x), (B, m), and its Jacobian, (m, B, n), differentiable."""
+    states = states.detach().requires_grad_()
+    answers = student(states)
+    each = torch.eye(answers.shape[1], device=states.device)[:, None].expand(-1, *answers.shape)
+    (jacobian,) = torch.autograd.grad(
+        answers, states, each, create_graph=True, is_grads_batched=True
+    )
+    return answers, jacobian
 
 
 def _derivative_along(
