@@ -140,48 +140,79 @@ def errors_of(
     probed = scales.probed("whitened") & ~np.isin(np.arange(states.shape[1]), list(held))
     if not 0 < probed.sum() <= _MOST:
         return None
-    columns = np.flatnonzero(probed)
-    axes = np.zeros((len(columns), 1, len(probed)))
-    axes[np.arange(len(columns)), 0, columns] = 1.0
+    axes = np.eye(len(probed))[probed][:, None]
     drawn = random.standard_normal((_DIRECTIONS, len(states), len(probed))) * probed
     drawn /= np.linalg.norm(drawn, axis=2, keepdims=True)
 
-    def ask(directions: np.ndarray, step: float) -> np.ndarray:
-        moves = step * scales.units * directions
-        return _answers(student, expert, units, states, moves)
+    def on_both_sides(directions: np.ndarray, step: float) -> np.ndarray:
+        moves = step * scales.units * np.stack([directions, -directions])
+        return np.stack([_answers(student, expert, units, states, side) for side in moves])
 
-    here = ask(axes[:1], 0.0)
-    near, wide, bent = (
-        [ask(axes, sign * step) for sign in (1, -1)] for step in (_NEAR, 2 * _NEAR, _BENT)
+    around = _Around(
+        _answers(student, expert, units, states, 0.0 * axes[:1])[0],
+        *(on_both_sides(axes, step) for step in (_NEAR, 2 * _NEAR, _BENT)),
+        on_both_sides(drawn, _BENT),
     )
-    away = [ask(drawn, sign * _BENT) for sign in (1, -1)]
-    every = np.concatenate([here, *near, *wide, *bent, *away])
-    heard = np.isfinite(every[..., 1, :]).all(axis=(0, 2))
+    heard = around.has_answers[:, 1]  # the expert's
     if not heard.any():
         return None
-    if not np.isfinite(every[:, heard]).all():
+    if not around.has_answers[heard].all():
         return Errors(*[math.inf] * 6, states=int(heard.sum()))
-    # A step of length 1 along one direction has the root mean square 1 / sqrt(d).
-    d = int(scales.live.sum())
-    here = here[:, heard]
-    near, wide, bent, away = (
-        [answers[:, heard] for answers in both] for both in (near, wide, bent, away)
-    )
-    first, second = (
-        (a - b) * (d**0.5 / (2 * s)) for (a, b), s in ((near, _NEAR), (wide, 2 * _NEAR))
-    )
-    curvature = d * max(_most(a + b - 2 * here) for a, b in (bent, away)) / _BENT**2
-    along = d**0.5 * _most(_apart(away[0] - away[1])) / (2 * _BENT)
-    factor = sphere_factor(len(columns), _DIRECTIONS, states=int(heard.sum()))
-    return Errors(
-        action=_most(_apart(here)),
-        derivative=_norm(_apart(first)),
-        difference=_norm(_apart(second - first)),
-        sphere=factor * (along + _BENT / d**0.5 * curvature),
-        lipschitz=max(_norm(first[..., 0, :]), _norm(first[..., 1, :])),
-        curvature=curvature,
-        states=int(heard.sum()),
-    )
+    return around.at(heard).errors(int(scales.live.sum()))
+
+
+@dataclass(frozen=True)
+class _Around:
+    """What student and expert answer around S states.
+
+    Attributes:
+        here: (S, 2, m) at the states, the student's first.
+        near: (2, K, S, 2, m) on both sides of them, along each of K coordinates that are probed.
+        wide: The same, twice as far.
+        bent: The same, farther still.
+        away: (2, _DIRECTIONS, S, 2, m) as far, along directions that were drawn.
+    """
+
+    here: np.ndarray
+    near: np.ndarray
+    wide: np.ndarray
+    bent: np.ndarray
+    away: np.ndarray
+
+    @property
+    def has_answers(self) -> np.ndarray:
+        """(S, 2) whether each answers throughout."""
+        sides = (self.near, self.wide, self.bent, self.away)
+        every = [np.isfinite(side).all(axis=(0, 1, 4)) for side in sides]
+        return np.isfinite(self.here).all(axis=2) & np.all(every, axis=0)
+
+    def at(self, chosen: np.ndarray) -> "_Around":
+        """Return what they answer around some of the states, by (S,) booleans."""
+        sides = (self.near, self.wide, self.bent, self.away)
+        return _Around(self.here[chosen], *(side[:, :, chosen] for side in sides))
+
+    def errors(self, d: int) -> Errors:
+        """Return the errors, where d coordinates move.
+
+        A step of length 1 along one direction has the root mean square 1 / sqrt(d).
+        """
+        first, second = (
+            (sides[0] - sides[1]) * (d**0.5 / (2 * step))
+            for sides, step in ((self.near, _NEAR), (self.wide, 2 * _NEAR))
+        )
+        bends = (_most(sides.sum(axis=0) - 2 * self.here) for sides in (self.bent, self.away))
+        curvature = d * max(bends) / _BENT**2
+        along = d**0.5 * _most(_apart(self.away[0] - self.away[1])) / (2 * _BENT)
+        factor = sphere_factor(self.near.shape[1], _DIRECTIONS, states=len(self.here))
+        return Errors(
+            action=_most(_apart(self.here)),
+            derivative=_norm(_apart(first)),
+            difference=_norm(_apart(second - first)),
+            sphere=factor * (along + _BENT / d**0.5 * curvature),
+            lipschitz=max(_norm(first[..., 0, :]), _norm(first[..., 1, :])),
+            curvature=curvature,
+            states=len(self.here),
+        )
 
 
 def _answers(
