@@ -149,9 +149,11 @@ def errors_of(
         return np.stack([_answers(student, expert, units, states, side) for side in moves])
 
     around = _Around(
-        _answers(student, expert, units, states, 0.0 * axes[:1])[0],
-        *(on_both_sides(axes, step) for step in (_NEAR, 2 * _NEAR, _BENT)),
-        on_both_sides(drawn, _BENT),
+        here=_answers(student, expert, units, states, 0.0 * axes[:1])[0],
+        near=on_both_sides(axes, _NEAR),
+        wide=on_both_sides(axes, 2 * _NEAR),
+        bent=on_both_sides(axes, _BENT),
+        away=on_both_sides(drawn, _BENT),
     )
     heard = around.has_answers[:, 1]  # the expert's
     if not heard.any():
