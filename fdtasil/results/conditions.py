@@ -149,16 +149,17 @@ def errors_of(
         return np.stack([_answers(student, expert, units, states, side) for side in moves])
 
     around = _Around(
-        here=_answers(student, expert, units, states, 0.0 * axes[:1])[0],
+        here=_answers(student, expert, units, states, np.zeros((1, 1, len(probed))))[0],
         near=on_both_sides(axes, _NEAR),
         wide=on_both_sides(axes, 2 * _NEAR),
         bent=on_both_sides(axes, _BENT),
         away=on_both_sides(drawn, _BENT),
     )
-    heard = around.has_answers[:, 1]  # the expert's
+    answered = around.answered
+    heard = answered[:, 1]  # the expert's
     if not heard.any():
         return None
-    if not around.has_answers[heard].all():
+    if not answered[heard].all():
         return Errors(*[math.inf] * 6, states=int(heard.sum()))
     return around.at(heard).errors(int(scales.live.sum()))
 
@@ -182,16 +183,18 @@ class _Around:
     away: np.ndarray
 
     @property
-    def has_answers(self) -> np.ndarray:
+    def _sides(self) -> tuple[np.ndarray, ...]:
+        return self.near, self.wide, self.bent, self.away
+
+    @property
+    def answered(self) -> np.ndarray:
         """(S, 2) whether each answers throughout."""
-        sides = (self.near, self.wide, self.bent, self.away)
-        every = [np.isfinite(side).all(axis=(0, 1, 4)) for side in sides]
+        every = [np.isfinite(side).all(axis=(0, 1, 4)) for side in self._sides]
         return np.isfinite(self.here).all(axis=2) & np.all(every, axis=0)
 
     def at(self, chosen: np.ndarray) -> "_Around":
         """Return what they answer around some of the states, by (S,) booleans."""
-        sides = (self.near, self.wide, self.bent, self.away)
-        return _Around(self.here[chosen], *(side[:, :, chosen] for side in sides))
+        return _Around(self.here[chosen], *(side[:, :, chosen] for side in self._sides))
 
     def errors(self, d: int) -> Errors:
         """Return the errors, where d coordinates move.
