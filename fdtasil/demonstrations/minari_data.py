@@ -16,7 +16,7 @@ from fdtasil.files.hdf5 import check_hdf5
 from fdtasil.files.names import check_no_links, stays_inside
 from fdtasil.files.reading import from_json, read_plain
 from fdtasil.files.storage import remove_folder
-from fdtasil.rollouts.flattening import bounds_of
+from fdtasil.rollouts.flattening import bounds_of, unbounded
 from fdtasil.rollouts.spaces import Mismatch, Spaces, UnknownSpace
 
 if TYPE_CHECKING:
@@ -75,7 +75,7 @@ def _dataset_of(source: "str | minari.MinariDataset", minari: Any) -> Dataset:
     for episode in episodes[1:]:
         states = states + episode
     ends = bounds_of(data.action_space, spaces.actions)
-    low, high = (np.asarray(bound, np.float32) for bound in ends)
+    low, high = (np.asarray(unbounded(bound), np.float32) for bound in ends)
     name = data.env_spec.id if data.env_spec else data.spec.dataset_id
     kept = spaces.unless_plain
     return Dataset(states, None, None, low, high, str(name), kept)

@@ -7,6 +7,7 @@ import numpy as np
 from fdtasil.demonstrations.dataset import Dataset, check_dataset
 from fdtasil.demonstrations.states import Demonstrations
 from fdtasil.errors import SettingError
+from fdtasil.rollouts.flattening import unbounded
 
 __all__ = ["from_arrays"]
 
@@ -75,7 +76,8 @@ def _numbers(name: str, given: Any) -> np.ndarray:
 
 def _bound(name: str, given: Any, usual: np.ndarray, m: int) -> np.ndarray:
     try:
-        return np.broadcast_to(np.asarray(usual if given is None else given, np.float32), (m,))
+        told = np.asarray(usual if given is None else given, np.float32)
+        return np.broadcast_to(unbounded(told), (m,))
     except (TypeError, ValueError):
         raise SettingError(
             f"{name}={given!r}", f"{m} numbers, or one for all", f"write {name}=-1.0"

@@ -43,6 +43,10 @@ class Demonstrations:
         """How many episodes the states are of."""
         return len(np.unique(self.episode))
 
+    def at(self, rows: np.ndarray) -> "Demonstrations":
+        """Return some of the states, given by (N,) bool or by numbers."""
+        return Demonstrations(*(part[rows] for part in vars(self).values()))
+
     def __add__(self, other: "Demonstrations") -> "Demonstrations":
         pairs = zip(vars(self).values(), vars(other).values(), strict=True)
         return Demonstrations(*(np.concatenate(pair) for pair in pairs))
@@ -82,7 +86,7 @@ def label(episodes: Episodes, expert: Expert, first_episode: int, round_: int) -
     if not none.any():
         return whole
     check_answered(expert.name, expert.silence, int(none.sum()), len(none), "visited states")
-    kept = Demonstrations(*(part[~none] for part in vars(whole).values()))
+    kept = whole.at(~none)
     # Where the last state is left out, the one before it is where the episode ended.
     ended = np.unique(whole.episode[whole.terminated])
     last = np.append(kept.episode[1:] != kept.episode[:-1], True)

@@ -63,6 +63,8 @@ def is_redundant(states: np.ndarray) -> bool:
     if count <= dimension:
         return False
     variances = np.linalg.eigvalsh(np.atleast_2d(np.cov(states.T)))
+    if not variances.any():  # all of one state
+        return False
     held = np.cumsum(variances[::-1]) / variances.sum()
     return int((held < _VARIANCE).sum()) + 1 < dimension / 2
 

@@ -3,7 +3,7 @@
 import os
 from collections.abc import Callable, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -58,6 +58,17 @@ class Answers:
             np.concatenate([self.values[:, ours], other.values[:, theirs]]),
             np.concatenate([self.gains, other.gains]),
         )
+
+    def at(self, rows: np.ndarray) -> "Answers":
+        """Return those around some states, given by their (S,) numbers."""
+        return replace(self, numbers=self.numbers[rows], values=self.values[rows])
+
+    def among(self, rows: np.ndarray, states: int) -> "Answers":
+        """Return answers around `states` states, those of (S,) rows as here, the others empty."""
+        numbers = np.zeros((states, *self.numbers.shape[1:]), self.numbers.dtype)
+        values = np.zeros((states, *self.values.shape[1:]), self.values.dtype)
+        numbers[rows], values[rows] = self.numbers, self.values
+        return replace(self, numbers=numbers, values=values)
 
 
 @dataclass(frozen=True)

@@ -93,8 +93,8 @@ def gains(
     known = isinstance(expert, Expert) and expert.memory is not None
     asked = load_expert(expert) if known else load_expert(expert, rows.shape[1])
     random = np.random.default_rng(check_count("seed", seed, 0))
-    noise, curvature = _law(asked, rows, units, random)
-    radius = _best_radius(noise, curvature)
+    noise, curvature, nearest = _law(asked, rows, units, random)
+    radius = _best_radius(noise, curvature, nearest)
     jacobian, near = (_jacobian(asked, rows, units * reach) for reach in (radius, radius / 2))
     # On average over the states: what is left of single ones is more chance than error.
     spread = (noise / radius)[:, None] / units
@@ -141,9 +141,10 @@ def _units(rows: np.ndarray, scale: np.ndarray | None) -> np.ndarray:
 
 def _law(
     expert: Expert, rows: np.ndarray, units: np.ndarray, random: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[np.ndarray, np.ndarray, float]:
     """Return (m,) a and b of the error of a derivative, a / radius and b * radius^2.
 
+    The third is the smallest radius that may be used: float32 rounds none of its halves away.
     Derivatives at a radius and at a quarter of it differ by the errors of both.
     """
     from scipy.optimize import nnls  # loads for a moment, and few need it
@@ -153,32 +154,41 @@ def _law(
     steps = np.zeros_like(states, np.float64)
     steps[np.arange(_RAYS), axes] = units[axes]
     slopes = np.stack([_slope(expert, states, steps * rung) / rung for rung in _RUNGS])
+    moving = np.array([_moves(states, steps * rung).all() for rung in _RUNGS])
+    if not moving[-1]:
+        raise SettingError(
+            f"scale from {units.min():g} of observations up to {np.abs(rows).max():g}",
+            "units that float32 does not round away there",
+            "raise scale, or leave it out",
+        )
     apart = np.nanmean(np.diff(slopes, axis=0) ** 2, axis=1)  # (rungs - 1, m)
     sizes = np.nanmean(slopes[1:] ** 2 + slopes[:-1] ** 2, axis=1)
     wide = _RUNGS[1:]
     law = np.stack([(1 + _RATIO**2) / wide**2, (1 - _RATIO**-2) ** 2 * wide**4], axis=1)
     noise, curvature = np.zeros((2, apart.shape[1]))
     for action, (squares, size) in enumerate(zip(apart.T, sizes.T, strict=True)):
-        told = size > 0  # steps smaller than those of the expert say nothing
+        # Steps smaller than those of the expert, or of float32, say nothing.
+        told = (size > 0) & moving[:-1]
         if not told.any():
             continue
         # Differences that agree to the bit agree to float32's rounding, and no better.
         squares = np.maximum(squares, np.where(told, size, 1) * _ROUNDING**2)
         best = int(np.where(told, squares / np.where(told, size, 1), np.inf).argmin())
         window = np.arange(max(0, best - _WINDOW), min(len(squares), best + 2))
+        window = window[told[window]]
         design = law[window] / squares[window, None]
         lengths = np.linalg.norm(design, axis=0)  # the columns lie twenty powers of ten apart
         fitted, _ = nnls(design / lengths, np.ones(len(design)))
         noise[action], curvature[action] = np.sqrt(fitted / lengths)
-    return noise, curvature
+    return noise, curvature, 2 * float(_RUNGS[moving.argmax()])
 
 
-def _best_radius(noise: np.ndarray, curvature: np.ndarray) -> float:
+def _best_radius(noise: np.ndarray, curvature: np.ndarray, nearest: float) -> float:
     """Return where the errors of all actions together are smallest, within the ladder."""
     a, b = float((noise**2).sum()), float((curvature**2).sum())
     if b == 0:
         return float(_RUNGS[-1])
-    return float(np.clip((a / (2 * b)) ** (1 / 6), _RUNGS[1], _RUNGS[-1]))
+    return float(np.clip((a / (2 * b)) ** (1 / 6), max(nearest, _RUNGS[1]), _RUNGS[-1]))
 
 
 def _jacobian(expert: Expert, rows: np.ndarray, steps: np.ndarray) -> np.ndarray:
@@ -187,6 +197,12 @@ def _jacobian(expert: Expert, rows: np.ndarray, steps: np.ndarray) -> np.ndarray
     states, moved = np.repeat(rows, n, axis=0), np.tile(np.diag(steps), (count, 1))
     slopes = _slope(expert, states, moved) / steps[np.tile(np.arange(n), count), None]
     return slopes.reshape(count, n, -1).transpose(0, 2, 1)
+
+
+def _moves(states: np.ndarray, steps: np.ndarray) -> np.ndarray:
+    """Return (R,) bool, whether float32 tells both ends of a difference from one another."""
+    ahead, behind = ((states + sign * steps).astype(np.float32) for sign in (1, -1))
+    return (ahead != behind).any(axis=1)
 
 
 def _slope(expert: Expert, states: np.ndarray, steps: np.ndarray) -> np.ndarray:

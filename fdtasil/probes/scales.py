@@ -11,9 +11,8 @@ __all__ = ["ROUNDING", "Scales", "measure_scales"]
 
 # A coordinate whose deviation is below this share of the median one does not move: what is left
 # is rounding (Humanoid has one of 1.8e-14), and dividing by it would blow up the first bump.
-_STILL = 1e-4
-# The normaliser divides by no less than this share of the median deviation.
-_FLOOR = 1e-2
+# Units may lie far apart: metres of altitude beside radians of an angle.
+_STILL = 1e-10
 ROUNDING = 64 * float(np.finfo(np.float32).eps)
 """Share of its values below which a coordinate's movement is rounding."""
 
@@ -83,8 +82,7 @@ def measure_scales(observations: np.ndarray, seen: np.ndarray | None = None) -> 
     moving = deviation > ROUNDING * np.abs(wide).max(axis=0)
     if not moving.any():  # a single state tells nothing of scales: raw units
         moving, deviation = np.ones_like(moving), np.ones_like(deviation)
-    median = float(np.median(deviation[moving]))
-    live = moving & (deviation > _STILL * median)
-    scale = np.where(live, np.maximum(deviation, _FLOOR * median), 1.0)
+    live = moving & (deviation > _STILL * np.median(deviation[moving]))
+    scale = np.where(live, deviation, 1.0)
     visible = np.ones_like(live) if seen is None else seen
     return Scales(mean, scale, deviation, live, visible, np.zeros_like(live))

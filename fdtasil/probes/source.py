@@ -94,6 +94,12 @@ class Probes:
                 "a finite stencil with asked directions, and none with differentiated ones",
                 'write probes="jacobian" for the exact derivative',
             )
+        if self.exact and self.resample:
+            raise SettingError(
+                "resample with exact derivatives",
+                "directions that are asked anew; a derivative stays the same",
+                'write probes="jacobian", or for example probes="sphere:10,resample"',
+            )
         if self.exact and self.has_labels:
             raise SettingError(
                 f"match={self.match!r} with exact derivatives",
@@ -148,6 +154,11 @@ class Probes:
     def exact(self) -> bool:
         """Whether the expert is differentiated, and not asked."""
         return self.stencil is not None and self.stencil.exact
+
+    @property
+    def is_open(self) -> bool:
+        """Whether a calibration finds the radius or the stencil."""
+        return self.radius in (None, "wide") or self.stencil is None
 
     @property
     def is_ranged(self) -> bool:

@@ -59,7 +59,7 @@ class Spread:
         if (
             low is None
             or high is None
-            or not (bounded := np.isfinite(low) & np.isfinite(high)).any()
+            or not (bounded := np.isfinite(low) & np.isfinite(high) & (low < high)).any()
         ):
             raise SettingError(
                 "spread='bounds' of observations without bounds", "finite ones", _EXAMPLE

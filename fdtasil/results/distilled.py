@@ -27,7 +27,7 @@ from fdtasil.results.card import card_of
 from fdtasil.results.evaluation import Evaluation
 from fdtasil.results.figures import FIGURES
 from fdtasil.results.page import result_html
-from fdtasil.student.exports import export
+from fdtasil.student.exports import SPACES, export
 from fdtasil.student.into_sb3 import agent_of
 from fdtasil.student.policy import Student
 from fdtasil.student.view import StudentObservation, Unseen, View
@@ -232,7 +232,7 @@ class Distilled:
             "fdtasil.expert_sha256": self.report["expert"]["sha256"] or "",
         }
         if self.student.spaces is not None:
-            metadata["fdtasil.spaces"] = json.dumps(self.student.spaces.to_json())
+            metadata[SPACES] = json.dumps(self.student.spaces.to_json())
         if self.steps_seen > 1:
             metadata[HISTORY] = str(self.steps_seen)
         if self.view.columns is not None:

@@ -14,7 +14,7 @@ import numpy as np
 from fdtasil.checks import check_count
 from fdtasil.compute import in_turn
 from fdtasil.errors import EnvironmentFault, SettingError, first_line, warn
-from fdtasil.rollouts.flattening import Flat, bounds_of
+from fdtasil.rollouts.flattening import Flat, bounds_of, unbounded
 from fdtasil.rollouts.spaces import Layout, Spaces, UnknownSpace, layout_of
 from fdtasil.rollouts.vector import Together, vector_of
 from fdtasil.rollouts.wanted import Environment
@@ -329,7 +329,7 @@ def _read_boxes(
     else:
         seen, acted = spaces.observations, spaces.actions
     ends = _action_bounds(environment, acted)
-    own = OwnBounds(*map(_unbounded, ends))
+    own = OwnBounds(*map(unbounded, ends))
     low, high = _rounded(own.low, np.inf), _rounded(own.high, -np.inf)
     if not (low < high).all():
         first = int((~(low < high)).argmax())
@@ -339,7 +339,7 @@ def _read_boxes(
             "drop the fixed actions with a gymnasium.ActionWrapper",
         )
     wide = (
-        _unbounded(bound.astype(np.float64))
+        unbounded(bound.astype(np.float64))
         for bound in bounds_of(environment.observation_space, seen)
     )
     return Boxes(seen.size, low, high, *wide), own
@@ -358,12 +358,6 @@ def _action_bounds(
         if clips:
             return bounds_of(layer.action_space, layout)
     return bounds_of(environment.action_space, layout)
-
-
-def _unbounded(bound: np.ndarray) -> np.ndarray:
-    """Return bounds in their own dtype; those as large as float32 itself are a way to say none."""
-    wide = bound.astype(np.float64)
-    return np.where(np.abs(wide) > 1e30, np.copysign(np.inf, wide), wide).astype(bound.dtype)
 
 
 def _rounded(bound: np.ndarray, inwards: float) -> np.ndarray:

@@ -7,7 +7,7 @@ import numpy as np
 
 from fdtasil.rollouts.spaces import Layout, Spaces
 
-__all__ = ["Flat", "bounds_of"]
+__all__ = ["Flat", "bounds_of", "unbounded"]
 
 
 class Flat(gymnasium.Wrapper):
@@ -51,6 +51,12 @@ def bounds_of(space: gymnasium.Space, layout: Layout) -> tuple[np.ndarray, np.nd
         lows.append(np.asarray(low).ravel())
         highs.append(np.asarray(high).ravel())
     return np.concatenate(lows), np.concatenate(highs)
+
+
+def unbounded(bound: np.ndarray) -> np.ndarray:
+    """Return bounds in their own dtype; those as large as float32 itself are a way to say none."""
+    wide = bound.astype(np.float64)
+    return np.where(np.abs(wide) > 1e30, np.copysign(np.inf, wide), wide).astype(bound.dtype)
 
 
 def _box(space: gymnasium.Space, layout: Layout) -> gymnasium.spaces.Box:

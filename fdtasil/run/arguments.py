@@ -44,8 +44,8 @@ class Arguments:
         given: The dataset, or None.
         preset: Where the defaults come from.
         probes: The derivative source, but for what a calibration finds; None for cloning.
-        anew: The source that is taken instead where the expert is cheap to ask; None where a
-            caller says which it is.
+        anew: The source that is taken instead where there is an expert to ask; None for none.
+        anew_if_cheap: Whether it has to be cheap to ask: nobody says which source is meant.
         trainer: Who acts in which round; None where the dataset is given.
         episodes: Number of demonstrations.
         horizon: T, or None for the environment's own.
@@ -64,6 +64,7 @@ class Arguments:
     preset: Preset
     probes: Probes | None
     anew: Probes | None
+    anew_if_cheap: bool
     trainer: Trainer | None
     episodes: int
     horizon: int | None
@@ -99,15 +100,22 @@ class Arguments:
         usual = self._usual(subject)
         if self.anew is None or subject.expert is None:
             return usual
+        student = self.student or usual_architecture(anew=True)
+        fresh = replace(
+            usual,
+            probes=self.anew,
+            # What a stored source left open was found when it was asked for the first time.
+            calibrated=self.preset.calibrates(self.anew) and self.anew.is_open,
+            probes_given=False,
+            student=student,
+        )
+        if not self.anew_if_cheap:
+            return fresh
         work = multiply_adds(subject.expert, usual.observation_size)
         if work is None:
             return replace(usual, reason="asked once: what a query costs is not known")
         if work > CHEAP:
             return replace(usual, reason=f"asked once: {work:,} multiply-adds a query")
-        student = self.student or usual_architecture(anew=True)
-        fresh = replace(
-            usual, probes=self.anew, calibrated=True, probes_given=False, student=student
-        )
         due = fresh.most_queries()
         allowed = self.max_queries is None or due <= self.max_queries
         if not (allowed if anew is None else anew):
@@ -187,7 +195,8 @@ def read_arguments(
         given=given,
         preset=defaults,
         probes=_source_of(probes, defaults, fit.order, given, curved=curved),
-        anew=_source_anew(defaults, fit.order, given, curved=curved) if probes is None else None,
+        anew=_source_anew(probes, defaults, fit.order, given, curved=curved),
+        anew_if_cheap=probes is None,
         trainer=_trainer_of(trainer, given),
         episodes=_episodes_of(episodes, given),
         horizon=None if horizon is None else check_count("horizon", horizon),
@@ -275,16 +284,26 @@ def _source_of(
 
 
 def _source_anew(
-    preset: Preset, order: int, given: Dataset | None, *, curved: bool
+    spec: int | str | Probes | None,
+    preset: Preset,
+    order: int,
+    given: Dataset | None,
+    *,
+    curved: bool,
 ) -> Probes | None:
-    """Return the source that nobody asked for, but that teaches best where queries are cheap.
+    """Return the source that is asked anew where there is somebody to ask.
 
-    Stored answers that were asked once are what their owner wants to be used.
+    Stored answers that were asked once are what their owner wants to be used. Where nobody asks
+    for a source and none is stored, "fresh" teaches best.
     """
-    stored = given.probes if given is not None else None
-    if not preset.calibrated or (stored is not None and not stored.resample):
-        return None
-    return _source_of(FRESH, preset, order, None, curved=curved)
+    stored = given.probes if given is not None and given.answers is not None else None
+    if spec is not None:
+        asked = preset.complete(Probes.parse(spec))
+        anew = asked is not None and asked.resample and stored is not None
+        return _source_of(asked, preset, order, None, curved=curved) if anew else None
+    if stored is not None:
+        return stored.with_order(order) if stored.resample else None
+    return _source_of(FRESH, preset, order, None, curved=curved) if preset.calibrated else None
 
 
 def _from_store(stored: Probes, order: int, given: Dataset | None) -> Probes:

@@ -39,7 +39,6 @@ class Asking:
         self._run, self._expert, self._account = run, expert, account
         self.source = run.probes
         self.calibration: Calibration | None = None
-        self._compared = False  # the expert's own derivatives with differences
 
     def calibrate(self, states: np.ndarray, scales: Scales) -> None:
         """Find what the source leaves open, once, on (N, n) states of the first round."""
@@ -94,9 +93,13 @@ class Asking:
         known = 0 if beginning.known is None else len(beginning.known)
         new = len(around.observations) - known
         due = around.probes.queries(new, len(around.live), visits=1)
+        # The expert's own derivatives are compared with differences once, before the first answer.
+        compares = self._run.own_derivatives and stream == (0, 0) and not known
         if self._run.own_derivatives:
-            due = new + (0 if self._compared else comparison_rows(around.observations.shape[1]))
+            due = new + (comparison_rows(around.observations.shape[1]) if compares else 0)
         self._account.check_budget(due, self._run.max_queries)
+        if compares:
+            check_derivatives(self._askable(), around.observations)
         return self._ask(around, stream, beginning, twin)
 
     def ask_again(
@@ -113,9 +116,6 @@ class Asking:
         beginning: Beginning,
         twin: DeviceTwin | None,
     ) -> Answers:
-        if self._run.own_derivatives and not self._compared:
-            check_derivatives(self._askable(), around.observations)
-            self._compared = True
         random = generator(self._run.seed, "probes", *stream)
         asked = twin and twin.values
         return ask_probes(self._askable(), around, random, self._run.order, beginning, asked)

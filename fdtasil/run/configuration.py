@@ -120,6 +120,7 @@ class Configuration:
             gates = 2 if self.evaluation_episodes else 1
             again = GATE_STATES if self.evaluation_episodes or self.trainer is not None else 0
             found["check"] = gates * GATE_QUERIES + self._largest_batch(found) + again
+            found["check"] += GATE_STATES if self.dataset is not None else 0
             found["evaluate"] = 2 * self.evaluation_episodes * self.horizon
         elif self.expert is not None:  # on the states of a dataset
             found["check"] = GATE_QUERIES + GATE_STATES
@@ -190,6 +191,14 @@ class Configuration:
         Raises:
             SettingError: If there are some.
         """
+        columns, held = self.student_obs, self.held
+        hidden = set(held) if not isinstance(columns, tuple) else self._but(columns) | {*held}
+        if not self.spread.where_still and (lost := sorted(hidden & {*self.spread.deviations})):
+            raise SettingError(
+                f"spread= of coordinate {lost[0]}, which no probe moves",
+                "coordinates that the student sees, no choices and nothing of the past",
+                "leave it out of spread=, or let student_obs= show it",
+            )
         if self.spread.deviations and self.probes is not None and not self.can_spread:
             how = "answers that are stored" if self.probes_given else "raw probes"
             raise SettingError(
@@ -197,6 +206,9 @@ class Configuration:
                 "probes in units of deviations, which are asked in this run",
                 "leave spread= out, or the dataset's answers (probes=0), or raw",
             )
+
+    def _but(self, columns: tuple[int, ...]) -> set[int]:
+        return set(range(self.observation_size)) - set(columns)
 
     def check_budget(self) -> None:
         """Refuse a run that may ask more than it is allowed to.
@@ -232,8 +244,8 @@ class Configuration:
     def _predicted_probes(self, probes: Probes) -> int:
         """Return the probe rows of all rounds.
 
-        New states are asked about once; a source that resamples asks about all states again, for
-        every sample but the first of every round.
+        New states are asked about once; a source that resamples asks about all states that it
+        trains on again, for every sample but the first of every round.
         """
         length = self._length
         collected, episodes, total = 0, 0, 0
@@ -244,5 +256,5 @@ class Configuration:
             once = probes.queries(1, self.observation_size, visits=1)
             visits = self.fit.schedule(anew=probes.resample).visits(collected - held)
             samples = probes.samples(self.observation_size, visits)
-            total += once * new + once * collected * (samples - 1)
+            total += once * new + once * (collected - held) * (samples - 1)
         return total

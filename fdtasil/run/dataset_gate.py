@@ -1,4 +1,4 @@
-"""The gate of an expert beside a dataset: on the states that are given, without an environment."""
+"""The gate of an expert beside a dataset: on the states that are given."""
 
 import numpy as np
 
@@ -14,12 +14,13 @@ __all__ = ["examine_given"]
 _SAME = 1e-2  # of the actions' deviation; demonstrators' files round, and clip
 
 
-def examine_given(expert: Expert, given: Dataset, *, force: bool) -> None:
+def examine_given(expert: Expert, given: Dataset, *, admit: bool, force: bool) -> None:
     """Check an expert on states of a dataset, and whether its answers are those that stand there.
 
     Args:
         expert: Counts its rows under "check".
         given: The dataset.
+        admit: Whether to check it; elsewhere an environment's states are for that.
         force: Only warn, where the expert answers at all.
 
     Raises:
@@ -28,8 +29,9 @@ def examine_given(expert: Expert, given: Dataset, *, force: bool) -> None:
     states = given.demonstrations
     chosen = np.linspace(0, len(states) - 1, GATE_STATES).round().astype(int)
     rows, said = states.observations[chosen], states.actions[chosen]
-    boxes = Boxes(rows.shape[1], given.low, given.high)
-    admit_expert(expert, rows, boxes, force=force)
+    if admit:
+        boxes = Boxes(rows.shape[1], given.low, given.high)
+        admit_expert(expert, rows, boxes, force=force)
     answers = expert.ask(rows, "check")
     heard = ~has_none(answers)
     spread = float(states.actions.std(axis=0, dtype=np.float64).mean()) or 1.0

@@ -6,18 +6,29 @@ import numpy as np
 
 from fdtasil.demonstrations.states import Demonstrations
 from fdtasil.errors import warn
+from fdtasil.probes.scales import Scales
+from fdtasil.probes.source import Probes
 from fdtasil.probes.spread import stands_still
 from fdtasil.rollouts.behaviours import Policy
 from fdtasil.rollouts.episodes import Episodes
 from fdtasil.rollouts.survivors import SURVIVORS
 from fdtasil.run.lesson import Lesson
+from fdtasil.student.fit import Fit
 
-__all__ = ["warn_of_falls", "warn_of_misfit", "warn_of_silence", "warn_of_still_coordinates"]
+__all__ = [
+    "warn_of_falls",
+    "warn_of_idle_weights",
+    "warn_of_misfit",
+    "warn_of_silence",
+    "warn_of_small_units",
+    "warn_of_still_coordinates",
+]
 
 _FEW = 5  # demonstrations, of which each counts
 _USUALLY = 0.75  # share of the expert's episodes that it survives
 _MISFIT = 0.15  # share of the actions' deviation; students of the experts here reach 0.01
 _SHOWN = 8  # coordinates named in a warning
+_SMALL = 1e-4  # of the median deviation; robots' observations differ by less
 
 
 def warn_of_falls(states: Demonstrations, expert: Episodes, keep: str) -> None:
@@ -37,6 +48,28 @@ def warn_of_falls(states: Demonstrations, expert: Episodes, keep: str) -> None:
             f"{', '.join(map(str, fallen))} of {horizon} steps, and the expert lasts in "
             f'{lasts:.0%} of its episodes: keep="survivors" records others in their place'
         )
+
+
+def warn_of_idle_weights(given: Fit | None, source: Probes | None, *, calibrated: bool) -> None:
+    """Warn of weights that somebody sets, and that nothing is multiplied by.
+
+    Args:
+        given: The optimisation that the caller asks for, or None.
+        source: The derivative source; plain cloning has no use for any of them.
+        calibrated: Whether a calibration may still decide what is matched.
+    """
+    if given is None or source is None:
+        return
+    weights, is_open = given.weights(source.match), source.match is None and calibrated
+    used = {
+        "weight": weights.derivative is not None,
+        "moved_weight": weights.moved is not None or is_open,
+    }
+    matched = "answers as labels" if source.match == "labels" else "differences"
+    for name, does in used.items():
+        value = getattr(given, name)
+        if not does and value != getattr(Fit(), name):
+            warn(f"{name}={value:g} weighs nothing: {source.describe()!r} matches {matched}")
 
 
 def warn_of_silence(shares: Mapping[str, float], reason: str, given_up: int) -> None:
@@ -76,6 +109,25 @@ def warn_of_misfit(lesson: Lesson, student: Policy, steps: int, *, remembers: bo
             f"at the demonstrated states the student's actions are off by {error / deviation:.0%} "
             f"of what the expert's vary by: {cause}, or want more than {steps:,} steps "
             f"(fit=fdtasil.Fit(steps={2 * steps}))"
+        )
+
+
+def warn_of_small_units(scales: Scales) -> None:
+    """Warn of coordinates that move so little that they may be still, or in other units.
+
+    Args:
+        scales: Of all states.
+    """
+    looked_at = scales.live & scales.seen
+    small = scales.deviation < _SMALL * np.median(scales.deviation[scales.live])
+    found = np.flatnonzero(looked_at & small & ~scales.told)
+    if len(found):
+        told = ", ".join(f"{i}: {scales.deviation[i]:.2g}" for i in found[:_SHOWN])
+        more = f" and {len(found) - _SHOWN} more" if len(found) > _SHOWN else ""
+        warn(
+            f"{len(found)} coordinates deviate by less than a ten-thousandth of what others do "
+            f"({told}{more}): that is taken for their units; of one that only stands nearly still "
+            "here, spread={coordinate: deviation} says how far it will go"
         )
 
 

@@ -35,7 +35,7 @@ from fdtasil.run.checkpoints import Checkpoints
 from fdtasil.run.collecting import Collecting
 from fdtasil.run.configuration import Configuration
 from fdtasil.run.dataset_gate import examine_given
-from fdtasil.run.doubts import warn_of_misfit, warn_of_silence
+from fdtasil.run.doubts import warn_of_idle_weights, warn_of_misfit, warn_of_silence
 from fdtasil.run.events import Callback, Event, tell_all
 from fdtasil.run.folder import asked_anew, open_run_folder
 from fdtasil.run.interrupts import heard_interrupts
@@ -178,6 +178,8 @@ def distill(
     given = None if dataset is None else load_dataset(dataset)
     history = history_with(check_count("history", history), given)
     check_history(history, student_obs)
+    if env is None:
+        _check_nothing_to_step(horizon=horizon, constraints=constraints)
     arguments = read_arguments(
         given,
         probes,
@@ -205,6 +207,7 @@ def distill(
         run, bars = arguments.configure(subject, going_on), Progress(progress)
         run.check_spread()
         run.check_budget()
+        warn_of_idle_weights(fit, run.probes, calibrated=run.calibrated)
         with (
             open_run_folder(folder, config_of(run), resume=resume is not None) as kept,
             heard_interrupts() as interrupts,
@@ -274,8 +277,8 @@ def evaluate(
     history = check_count("history", history)
     if isinstance(policy, Distilled):
         history = max(history, policy.steps_seen)
-        if history == 1 and student_obs is None:
-            student_obs = policy.view.columns
+        if history == 1 and student_obs is None and not policy.view.is_whole:
+            student_obs = policy.view.columns or policy.view.look
         policy = policy.student
     elif history == 1 and student_obs is None:
         history = said_history(policy)
@@ -319,6 +322,21 @@ def check_history(history: object, student_obs: object) -> int:
             f"history={count} with student_obs=", "one of the two", "leave one of them out"
         )
     return count
+
+
+def _check_nothing_to_step(**asked: object) -> None:
+    """Refuse what only an environment has a use for.
+
+    Raises:
+        SettingError: If something is asked for.
+    """
+    for name, value in asked.items():
+        if value is not None:
+            raise SettingError(
+                f"{name}= without an environment",
+                "nothing that is recorded or evaluated",
+                f"pass env=, or leave {name}= out",
+            )
 
 
 def _folder_of(out: str | Path | None, resume: str | Path | None) -> Path | None:
@@ -417,8 +435,8 @@ def _examined(
 ) -> Episodes | None:
     """Lead the expert through the gate; return its episodes where they are compared with."""
     run, expert, pool = rounds.run, subject.expert, subject.pool
-    if expert is not None and pool is None and given is not None:
-        examine_given(expert, given, force=force)
+    if expert is not None and given is not None:
+        examine_given(expert, given, admit=pool is None, force=force)
     if expert is None or pool is None:
         return None
     starts = episode_seeds(run.seed, "evaluation", 0, run.evaluation_episodes or GATE_STATES)

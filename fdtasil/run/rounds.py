@@ -23,7 +23,7 @@ from fdtasil.run.checkpoints import (
 )
 from fdtasil.run.collecting import Collecting
 from fdtasil.run.configuration import Configuration
-from fdtasil.run.doubts import warn_of_falls, warn_of_still_coordinates
+from fdtasil.run.doubts import warn_of_falls, warn_of_small_units, warn_of_still_coordinates
 from fdtasil.run.events import Event
 from fdtasil.run.lesson import Lesson
 from fdtasil.run.training import Training
@@ -69,8 +69,7 @@ class Rounds:
             policy = lesson.view.policy(trained.student.act) if lesson and trained else None
             lesson = self._learnt_from(round_, count, collected, lesson, policy)
             collected = lesson.collected
-            if expert is not None:
-                self._doubt(round_, lesson, expert)
+            self._doubt(round_, lesson, expert)
             trained = self._trained(round_, lesson, trained)
             last = trained.history[-1]
             self.training.callback(Event("round", round_, trained.steps, last, trained.student))
@@ -78,11 +77,14 @@ class Rounds:
         assert trained is not None, "every run has a round"
         return lesson, trained
 
-    def _doubt(self, round_: int, lesson: Lesson, expert: Episodes) -> None:
+    def _doubt(self, round_: int, lesson: Lesson, expert: Episodes | None) -> None:
         """Warn of what the demonstrations lack, as soon as it is known."""
-        if round_ == 0 and self.collecting is not None:
+        last = round_ == len(self.run.rounds) - 1
+        if last:
+            warn_of_small_units(lesson.scales)
+        if expert is not None and round_ == 0 and self.collecting is not None:
             warn_of_falls(lesson.dataset.demonstrations, expert, self.run.keep)
-        if round_ == len(self.run.rounds) - 1 and self.run.can_spread:
+        if expert is not None and last and self.run.can_spread:
             warn_of_still_coordinates(lesson, expert)
 
     def _trained(self, round_: int, lesson: Lesson, before: Trained | None) -> Trained:
@@ -175,7 +177,8 @@ class Rounds:
         known = self.checkpoints.take_up(round_, ASKED)
         asking = self.checkpoints.asking
         asking.calibrate(lesson.dataset.demonstrations.observations, lesson.scales)
-        around = asking.around(states, lesson.scales)
+        # What there is to warn of was said before the first answer.
+        around = asking.around(states, lesson.scales, again=known is not None)
         with self.training.progress.bar("probes", "state", len(states)) as bar:
 
             def told(values: np.ndarray, states: int) -> None:

@@ -17,12 +17,13 @@ __all__ = ["Samples"]
 
 @dataclass
 class Samples:
-    """The expert's answers, a sample of all states at a time.
+    """The expert's answers, a sample at a time: the first of all states, others where it trains.
 
     Attributes:
         asking: Asks for new ones.
         stored: The answers of sample 0.
         lesson: What is learnt, and its scales.
+        rows: (S,) the states that are trained on; others are held out, and looked at once.
         round: The round.
         device: Where is trained.
         asked_before: Number of the sample that the interrupted run had asked for last, or -1.
@@ -32,6 +33,7 @@ class Samples:
     asking: Asking
     stored: Answers
     lesson: Lesson
+    rows: np.ndarray
     round: int
     device: torch.device
     asked_before: int = -1
@@ -40,14 +42,13 @@ class Samples:
     @cached_property
     def around(self) -> Surroundings:
         """Where the source probes; the same for all samples."""
-        return self.asking.around(
-            self.lesson.dataset.demonstrations, self.lesson.scales, again=True
-        )
+        states = self.lesson.dataset.demonstrations.at(self.rows)
+        return self.asking.around(states, self.lesson.scales, again=True)
 
     @cached_property
     def twin(self) -> DeviceTwin | None:
         """Who answers on the device, or None where the expert itself is asked."""
-        return self.asking.twin(self.around, self.stored, self.device)
+        return self.asking.twin(self.around, self.stored.at(self.rows), self.device)
 
     @property
     def observations(self) -> np.ndarray:
@@ -68,4 +69,5 @@ class Samples:
 
     def _ask(self, number: int) -> Answers:
         ask = self.asking.ask_again if number == self.asked_before else self.asking.ask
-        return ask(self.around, self.round, number, twin=self.twin)
+        answers = ask(self.around, self.round, number, twin=self.twin)
+        return answers.among(self.rows, len(self.observations))

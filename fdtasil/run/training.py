@@ -16,7 +16,7 @@ from fdtasil.run.interrupts import Interrupts
 from fdtasil.run.lesson import Lesson
 from fdtasil.run.samples import Samples
 from fdtasil.seeding import torch_generator
-from fdtasil.student.fit import Hooks, fit
+from fdtasil.student.fit import Hooks, fit, hold_out
 from fdtasil.student.fit_state import FitState
 from fdtasil.student.policy import Student
 
@@ -64,7 +64,7 @@ class Training:
                 self.checkpoints.asking.source,
                 _seen_by(lesson, samples) if samples else None,
                 run.fit,
-                lambda name: torch_generator(run.seed, "batches", round_, name),
+                self._stream(round_),
                 hooks=Hooks(
                     bar.lengthen,
                     self._tell(round_, steps, bar),
@@ -76,12 +76,17 @@ class Training:
         steps += int(entries[-1]["step"])
         return Trained(student.cpu(), [*(before.history if before else []), *history], steps)
 
+    def _stream(self, round_: int) -> Callable[[str], torch.Generator]:
+        return lambda name: torch_generator(self.run.seed, "batches", round_, name)
+
     def _samples(self, round_: int, lesson: Lesson, kept: Halfway | None) -> Samples | None:
-        stored = lesson.dataset.answers
-        if self.checkpoints.asking.source is None or stored is None:
+        dataset, asking = lesson.dataset, self.checkpoints.asking
+        if asking.source is None or dataset.answers is None:
             return None
-        asked_before = kept.sample if kept else -1
-        return Samples(self.checkpoints.asking, stored, lesson, round_, self.device, asked_before)
+        stream = self._stream(round_)("held out")
+        rows, _ = hold_out(dataset.demonstrations, self.run.fit, stream)
+        before = kept.sample if kept else -1
+        return Samples(asking, dataset.answers, lesson, rows.numpy(), round_, self.device, before)
 
     def _fresh(self, seen: Demonstrations, lesson: Lesson, round_: int) -> Student:
         scales, bounds = lesson.normaliser(seen.observations), lesson.dataset

@@ -42,11 +42,17 @@ class Layers:
     agreement: float
 
 
-def c_header(policy: PlainPolicy) -> str:
-    """Return the declarations of a student's C file."""
+def c_header(policy: PlainPolicy, order: str = "") -> str:
+    """Return the declarations of a student's C file.
+
+    Args:
+        policy: The student.
+        order: What stands where in an observation, if somebody knows.
+    """
     n, m = len(policy.mean), len(policy.centre)
+    told = f"\n   Observation: {_plainly(order)}. " if order else " "
     return (
-        "/* Written by fdtasil. */\n"
+        f"/* Written by fdtasil.{told}*/\n"
         "#ifndef STUDENT_H\n#define STUDENT_H\n\n"
         f"#define STUDENT_OBSERVATIONS {n}\n#define STUDENT_ACTIONS {m}\n\n"
         "/* Raw observation -> action in the environment's units. Not reentrant: its buffers are\n"
@@ -208,20 +214,39 @@ FLOAT = Layers(
 """Weights as they are."""
 _MAIN = """#ifdef STUDENT_MAIN
 #include <stdio.h>
-/* Reads observations, numbers with spaces between, and writes a line of actions for each. */
+/* Skips blanks; returns the character behind them, which is still to be read. */
+static int ahead(void)
+{
+    int c;
+    do
+        c = getchar();
+    while (c == ' ' || c == '\\t' || c == '\\r');
+    return ungetc(c, stdin);
+}
+/* Reads a line of numbers for each observation, and writes a line of actions. */
 int main(void)
 {
-    float observation[STUDENT_OBSERVATIONS], action[STUDENT_ACTIONS];
-    int i;
-    for (;;) {
-        for (i = 0; i < STUDENT_OBSERVATIONS; i++)
-            if (scanf("%f", &observation[i]) != 1)
-                return 0;
+    float observation[STUDENT_OBSERVATIONS], action[STUDENT_ACTIONS], value;
+    int i, line;
+    for (line = 1; ahead() != EOF; line++) {
+        for (i = 0; ahead() != '\\n' && ahead() != EOF; i++) {
+            if (scanf("%f", &value) != 1)
+                break;
+            if (i < STUDENT_OBSERVATIONS)
+                observation[i] = value;
+        }
+        if (i != STUDENT_OBSERVATIONS || (ahead() != '\\n' && ahead() != EOF)) {
+            fprintf(stderr, "line %d: expected %d numbers with blanks between\\n", line,
+                    STUDENT_OBSERVATIONS);
+            return 2;
+        }
+        getchar();
         student(observation, action);
         for (i = 0; i < STUDENT_ACTIONS; i++)
             printf("%.9g%c", (double)action[i], i + 1 < STUDENT_ACTIONS ? ' ' : '\\n');
         fflush(stdout);
     }
+    return 0;
 }
 #endif
 """

@@ -8,6 +8,7 @@ import numpy as np
 
 from fdtasil.checks import check_choice
 from fdtasil.errors import ExportError, SettingError
+from fdtasil.experts.onnx_expert import HISTORY
 from fdtasil.files.onnx.export import check_finite, export_module
 from fdtasil.student import plain
 from fdtasil.student.c_int8 import INT8, rounded
@@ -18,7 +19,10 @@ from fdtasil.student.plain import PlainPolicy
 from fdtasil.student.policy import Student
 from fdtasil.student.tflite import tflite_model
 
-__all__ = ["EXPORTS", "export"]
+__all__ = ["EXPORTS", "SPACES", "export"]
+
+SPACES = "fdtasil.spaces"
+"""What a file calls the spaces of its environment."""
 
 Writer = Callable[[Student, np.ndarray, Mapping[str, str]], bytes]
 """A student, (B, n) states of its training and metadata -> the bytes of a file."""
@@ -64,9 +68,32 @@ def _plain(student: Student) -> PlainPolicy:
     return found
 
 
+def _order(student: Student, metadata: Mapping[str, str]) -> str:
+    """Return what stands where in an observation, "" where it is a plain vector."""
+    if HISTORY in metadata:
+        steps, m = int(metadata[HISTORY]), student.action_size
+        n = (student.observation_size - (steps - 1) * m) // steps
+        return (
+            f"0:{n} now, then for each of {steps - 1} steps before, the latest first, {n} of its "
+            f"observation and {m} of its action; zeros before an episode began"
+        )
+    layout = student.spaces.observations if student.spaces else None
+    if layout is None or not layout.names:
+        return ""
+    pairs = zip(layout.parts, layout.starts, strict=True)
+    return ", ".join(f"{start}:{start + part.size} {part.name}" for part, start in pairs)
+
+
+def _comment(student: Student, metadata: Mapping[str, str]) -> dict[str, str]:
+    """Return the lines of a C file's comment: of the spaces, those that a reader needs."""
+    order = _order(student, metadata)
+    kept = {name: text for name, text in metadata.items() if name != SPACES}
+    return kept | ({"observation": order} if order else {})
+
+
 def _c(student: Student, states: np.ndarray, metadata: Mapping[str, str]) -> bytes:
     policy = _plain(student)
-    source = c_source(policy, metadata)
+    source = c_source(policy, _comment(student, metadata))
     check_parity(source, policy, states)
     return source.encode()
 
@@ -75,7 +102,7 @@ def _int8_c(student: Student, states: np.ndarray, metadata: Mapping[str, str]) -
     policy = _plain(student)
     small = rounded(policy)
     check_change(small(states), student, states, "export it as .c")
-    source = c_source(policy, metadata, INT8)
+    source = c_source(policy, _comment(student, metadata), INT8)
     check_parity(source, small, states, INT8.agreement)
     return source.encode()
 
@@ -85,7 +112,7 @@ def _tflite(student: Student, states: np.ndarray, metadata: Mapping[str, str]) -
 
 
 def _h(student: Student, states: np.ndarray, metadata: Mapping[str, str]) -> bytes:
-    return c_header(_plain(student)).encode()
+    return c_header(_plain(student), _order(student, metadata)).encode()
 
 
 def _py(student: Student, states: np.ndarray, metadata: Mapping[str, str]) -> bytes:

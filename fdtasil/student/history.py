@@ -43,6 +43,7 @@ class History:
                 "pass the history that it was trained with",
             )
         self._student = student
+        self._bounds = student.low.cpu().numpy(), student.high.cpu().numpy()
         self._window = Window(history, self.observation_size, m)
 
     def predict(
@@ -66,7 +67,8 @@ class History:
         rows = self._window.behind(seen)[None].astype(np.float32)
         action, spaces = self._student.answer(rows)[0], self._student.spaces
         if spaces is None:
-            self._window.push(seen, action)
+            # Beyond its one bound the environment cuts an action off: what is done is remembered.
+            self._window.push(seen, np.clip(action, *self._bounds))
             return action, None
         self._window.push(seen, spaces.actions.done(action))
         return spaces.actions.value(action), None

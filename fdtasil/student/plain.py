@@ -122,7 +122,10 @@ class PlainPolicy:
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
         """(n,) or (B, n) raw observations -> (m,) or (B, m) float32 actions."""
-        value = (observation - self.mean) / self.scale
+        value = np.asarray(observation)
+        if value.shape[-1:] != self.mean.shape:  # one number would be taken for all of them
+            raise ValueError(f"observations of shape {value.shape}, not (..., {len(self.mean)})")
+        value = (value - self.mean) / self.scale
         *hidden, (weights, biases) = self.layers
         bend = PLAIN[self.activation]
         for inner, offsets in hidden:
