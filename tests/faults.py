@@ -247,6 +247,24 @@ FAULTS = {
         228: "actions that differ, and are the same to the environment",
         229: "a student without an answer, which would meet every condition",
     },
+    "what is silently another thing": {
+        230: "a coordinate in small units, taken for one that stands still",
+        231: "bounds of an array or a dataset that are as large as float32",
+        232: "a result that sees through a function, judged without it",
+        233: "a dataset of one expert beside another, in an environment",
+        234: "an action beyond its one bound, remembered as it was not taken",
+        235: "an offset beside which float32 rounds steps away, where gains are measured",
+        236: "own derivatives that are compared again after an interruption",
+        237: "a warning that an interruption says twice",
+        238: "held-out states that are asked about as often as others, beyond the budget",
+        239: "fresh queries beside stored answers, which are not asked",
+        240: "a weight of the loss that weighs nothing",
+        241: "a spread of a coordinate that no probe moves",
+        242: "bounds without a distance between them, as a spread",
+        243: "rounding beside an offset, taken for noise",
+        244: "a number where a file for robots expects an observation",
+        245: "a line of too few or too many numbers, for the program in C",
+    },
 }
 
 LEFT_OUT: dict[int, str] = {}

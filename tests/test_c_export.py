@@ -3,6 +3,7 @@
 import pickle
 import subprocess
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -12,6 +13,7 @@ from test_student import make
 import fdtasil
 from fdtasil.errors import ExpertError, ExportError, SettingError
 from fdtasil.files.compiled import compiler
+from fdtasil.rollouts.spaces import Spaces, layout_of
 from fdtasil.student.architectures import ACTIVATIONS
 from fdtasil.student.c_int8 import INT8, rounded
 from fdtasil.student.c_source import FLOAT, c_memory, c_source, check_parity
@@ -271,3 +273,41 @@ def test_threads_do_not_mix_the_buffers_of_compiled_code(quick, tmp_path):
     threads = fdtasil.load_expert(path, trust="c", workers=4, threads=True, batch=256)
     alone = fdtasil.load_expert(path, trust="c")
     assert np.array_equal(threads.ask(rows, "act"), alone.ask(rows, "act"))
+
+
+@pytest.mark.fault(245)
+@needs_a_compiler
+@pytest.mark.parametrize("text", ["1 2\n1 2 3\n", "1 2 3 4\n", "1,2,3\n", "1 2 x\n", "1"])
+def test_a_line_of_other_numbers_ends_the_program(text, tmp_path):
+    """Elsewhere it would shift all that follow."""
+    program = built(export(make((8,)), NEAR, {}, "student.c"), tmp_path)
+    for before in ("", "\n1 2 3\n"):
+        ended = subprocess.run([program], input=before + text, capture_output=True, text=True)
+        assert ended.returncode == 2
+        assert f"line {before.count(chr(10)) + 1}: expected 3 numbers" in ended.stderr
+        assert len(ended.stdout.splitlines()) == len(before.split()) // 3
+
+
+@pytest.mark.fault(244)
+@pytest.mark.parametrize("wrong", [0.5, [0.5], np.ones((3, 1)), np.zeros(4), np.zeros((2, 4))])
+def test_in_numpy_alone_another_shape_is_refused(wrong):
+    policy = make((8,)).plain
+    with pytest.raises(ValueError, match=r"not \(\.\.\., 3\)"):
+        policy(wrong)
+    assert policy(np.zeros((2, 3))).shape == (2, 2)
+
+
+def test_the_comment_says_what_stands_where():
+    parts = gymnasium.spaces.Dict(
+        goal=gymnasium.spaces.Box(-1, 1, (1,)), pose=gymnasium.spaces.Box(-1, 1, (2,))
+    )
+    box = gymnasium.spaces.Box(-1, 1, (2,))
+    spaces = Spaces(layout_of(parts, "observations"), layout_of(box, "actions"))
+    ones, start = np.ones(3), torch.Generator()
+    student = fdtasil.Student(
+        fdtasil.Mlp(8), 0 * ones, ones, -ones[:2], ones[:2], start, spaces=spaces
+    )
+    for name in ("student.c", "student.h"):
+        assert "bservation: 0:1 goal, 1:3 pose" in export(student, NEAR, {}, name).decode()
+    told = export(make((8,)), NEAR, {"fdtasil.history": "1"}, "student.h").decode()
+    assert "0:3 now, then for each of 0 steps before" in told

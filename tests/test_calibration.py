@@ -31,3 +31,14 @@ def test_regimes_are_told_apart(regime, tmp_path):
         assert found.noise_floor == pytest.approx(1e-3, rel=0.3)
     if regime == "smooth":
         assert found.noise_floor < 1e-6
+
+
+@pytest.mark.fault(243)
+@pytest.mark.parametrize("offset", [0, 300, 3e3, 3e4])
+def test_rounding_beside_an_offset_is_no_noise(offset):
+    """What float32 rounds away of a step is nothing of the expert's."""
+    rows = (offset + STATES).astype(np.float32)
+    expert = load_expert(lambda x: np.tanh(x[:, :2].astype(np.float64) - offset))
+    found = calibrate(expert, rows, measure_scales(rows), np.random.default_rng(0), 0.3)
+    assert (found.regime, found.radius, found.stencil) == ("smooth", 0.3, "forward")
+    assert len(found.radii) == len(found.similarity) == len(found.change) >= 2

@@ -339,3 +339,31 @@ def test_an_expert_beside_a_dataset_passes_a_gate_too(arrays):
     result = fdtasil.distill(lambda rows: rows @ GAIN.T, **options)
     assert result.queries == result.report["predicted_queries"]
     assert repr(data).startswith("Dataset(arrays: 40 states of 1 episodes")
+
+
+def backwards(observations):
+    return observations[:, ::-1]
+
+
+@pytest.mark.fault(232)
+def test_a_result_is_judged_through_its_own_function(linear, tmp_path):
+    result = fdtasil.distill(linear, TOY, "3,forward", student_obs=backwards, **QUICK)
+    found = fdtasil.evaluate(result, linear, TOY, episodes=2, horizon=20)
+    assert found == result.evaluation
+    read = fdtasil.Distilled.load(result.save(tmp_path))
+    with pytest.raises(SettingError, match="no file can hold"):
+        fdtasil.evaluate(read, linear, TOY, episodes=2, horizon=20)
+
+
+@pytest.mark.fault(233)
+def test_another_expert_than_the_datasets_is_warned_of_in_an_environment_too(run, linear):
+    other = lambda rows: 0.5 * linear(rows)  # noqa: E731
+    with pytest.warns(FdtasilWarning, match="otherwise than the demonstrations at 16 of 16"):
+        result = fdtasil.distill(other, TOY, dataset=run, **QUICK)
+    assert result.queries["check"] == result.report["predicted_queries"]["check"]
+
+
+@pytest.mark.parametrize("asked", [{"horizon": 7}, {"constraints": {"a": lambda x, u: x[:, 0]}}])
+def test_what_only_an_environment_has_a_use_for_is_refused_without_one(asked, run):
+    with pytest.raises(SettingError, match="without an environment"):
+        fdtasil.distill(dataset=run, **asked, **SMALL)

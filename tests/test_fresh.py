@@ -11,7 +11,7 @@ from onnx import TensorProto
 from toy_environments import Integrator
 
 import fdtasil
-from fdtasil.errors import ExpertError, SettingError
+from fdtasil.errors import ExpertError, FdtasilWarning, SettingError
 from fdtasil.experts.cost import CHEAP, multiply_adds
 from fdtasil.experts.load import load_expert
 from fdtasil.probes.answers import ask_probes
@@ -439,3 +439,73 @@ def test_a_twin_that_is_infinite_is_named():
         twin.module.weight[0] = torch.inf
     with pytest.raises(ExpertError, match="infinite on some of 60"):
         ask_probes(asked, around, np.random.default_rng(1), asked=twin.values)
+
+
+@pytest.mark.fault(238)
+def test_held_out_states_are_asked_about_once(expert):
+    """So a budget that allows the run at the start allows its end."""
+    fit = Fit(steps=300, validation=0.5)
+    run = {**QUICK, "fit": fit, "evaluation_episodes": 0}
+    result = fdtasil.distill(expert, TOY, "fresh", **run)
+    assert result.queries == result.report["predicted_queries"]
+    samples = -(-300 * 20 // 200)  # twenty states of one episode, ten visits a sample
+    assert result.queries["probe"] == 400 + 200 * (samples - 1)
+
+
+@pytest.mark.fault(239)
+def test_fresh_is_asked_anew_beside_answers_of_fresh(expert):
+    given = fdtasil.distill(expert, TOY, "fresh", **QUICK).dataset
+    run = {"dataset": given, "fit": QUICK["fit"], "student": QUICK["student"]}
+    usual = fdtasil.distill(expert, TOY, evaluation_episodes=0, **run)
+    told = fdtasil.distill(expert, TOY, "fresh", evaluation_episodes=0, **run)
+    assert usual.queries["probe"] == told.queries["probe"] == 1600
+    assert usual.queries["calibrate"] == 0  # what was open is stored
+    assert told.report["probes"] == usual.report["probes"] == given.probes.describe()
+
+
+def test_another_source_than_fresh_is_asked_anew_too(expert):
+    given = fdtasil.distill(expert, TOY, "sphere:4,resample", **QUICK).dataset
+    again = fdtasil.distill(expert, TOY, dataset=given, **QUICK)
+    assert again.report["probes"].startswith("sphere:4,")
+    assert "resample" in again.report["probes"]
+
+
+@pytest.mark.fault(240)
+def test_a_weight_of_nothing_is_warned_of(expert):
+    with pytest.warns(FdtasilWarning, match="weight=50 weighs nothing: 'adaptive:10"):
+        fdtasil.distill(expert, TOY, "fresh", **{**QUICK, "fit": Fit(steps=20, weight=50)})
+    run = {**QUICK, "fit": Fit(steps=20, moved_weight=2)}
+    with pytest.warns(FdtasilWarning, match="moved_weight=2 weighs nothing"):
+        fdtasil.distill(expert, TOY, "3,differences", **run)
+
+
+@pytest.mark.fault(241)
+@pytest.mark.parametrize("probes", [0, 3])
+def test_a_spread_that_moves_nothing_is_refused(probes):
+    with pytest.raises(SettingError, match="spread= of coordinate 4, which no probe moves"):
+        fdtasil.distill(linear, TOY, probes, student_obs=[0, 1], spread={0: 1.0, 4: 2.0}, **QUICK)
+    with pytest.raises(SettingError, match="spread= of coordinate 6"):
+        fdtasil.distill(linear, TOY, probes, history=2, spread={6: 2.0}, **QUICK)
+
+
+class Padded(Integrator):
+    """Its last coordinate is padding."""
+
+    def __init__(self):
+        super().__init__()
+        high = np.array([9, 9, 9, 9, 1], np.float32)
+        low = np.array([-9, -9, -9, -9, 1], np.float32)
+        self.observation_space = gymnasium.spaces.Box(low, high)
+
+
+@pytest.mark.fault(242)
+@pytest.mark.parametrize("probes", [0, "sphere:3", 3])
+def test_bounds_of_padding_are_no_spread(probes):
+    result = fdtasil.distill(linear, Padded, probes, spread="bounds", **QUICK)
+    assert result.settings["spread"]["bounds"].keys() == {"0", "1", "2", "3"}
+    assert np.isfinite(result.history[-1]["loss"])
+
+
+def test_derivatives_are_not_asked_anew():
+    with pytest.raises(SettingError, match="resample with exact derivatives"):
+        Probes.parse("jacobian,resample")

@@ -140,3 +140,26 @@ def test_derivatives_of_something_else_are_named():
         )
     with pytest.raises(ExpertError, match="differentiated twice"):
         fdtasil.distill(sensitive, TOY, **{**run, "fit": fdtasil.Fit(steps=40, order=2)})
+
+
+@pytest.mark.fault(235)
+@pytest.mark.parametrize("spread", [0.3, 0.1])
+@pytest.mark.parametrize("law", [np.tanh, np.sin, lambda x: np.clip(x, -1, 1)])
+def test_an_offset_that_float32_rounds_beside_is_no_failure(law, spread):
+    """A thermostat: 300 kelvins, and a few tenths of them around."""
+    rows = 300 + spread * np.random.default_rng(0).standard_normal((50, 2))
+    rows = rows.astype(np.float32)
+
+    def thermostat(observations):
+        return law(20 * (observations[:, :1].astype(np.float64) - 300))
+
+    found = gains(thermostat, rows)
+    inner = 20 * (rows[:, 0].astype(np.float64) - 300)
+    near = 1e-6 * (law(inner + 1e6**-1) - law(inner - 1e6**-1)) / 2e-12
+    smooth = np.abs(law(inner + 0.2) - law(inner - 0.2) - 0.4 * near) < 0.02  # no kink nearby
+    assert found.jacobian[smooth, 0, 0] == pytest.approx(20 * near[smooth], abs=0.2)
+
+
+def test_a_scale_that_is_rounded_away_is_refused():
+    with pytest.raises(SettingError, match="scale from 1e-12"):
+        gains(lambda rows: rows[:, :1], np.full((3, 2), 1e4), scale=np.full(2, 1e-12))

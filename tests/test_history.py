@@ -3,6 +3,7 @@
 import gymnasium
 import numpy as np
 import pytest
+import torch
 from conftest import GAIN, QUICK, TOY, mlp_onnx
 from test_memory import Remembers
 
@@ -185,3 +186,18 @@ def test_another_past_or_memory_than_the_datasets_is_refused(file):
         fdtasil.distill(Remembers(), TOY, dataset=with_memory, history=2, progress=False)
     with pytest.raises(SettingError, match="with student_obs"):
         fdtasil.distill(Remembers(), TOY, dataset=with_memory, student_obs=[0], progress=False)
+
+
+@pytest.mark.fault(234)
+def test_what_is_remembered_is_what_an_environment_with_one_bound_takes():
+    size, low, high = N + PAST, np.zeros(M), np.full(M, np.inf)
+    student = fdtasil.Student(
+        fdtasil.Mlp(8), np.zeros(size), np.ones(size), low, high, torch.Generator().manual_seed(0)
+    )
+    policy, past = fdtasil.History(student, H), np.zeros(PAST)
+    for step, row in enumerate(np.random.default_rng(0).standard_normal((20, N))):
+        action, _ = policy.predict(row, episode_start=step == 0)
+        whole = np.concatenate([row, past])[None].astype(np.float32)
+        assert action == pytest.approx(student.act(whole)[0], abs=1e-6)
+        assert action.min() < 0 or step > 0
+        past = np.concatenate([row, np.maximum(action, 0), past[: -(N + M)]])

@@ -4,12 +4,13 @@ import warnings
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import pytest
-from conftest import QUICK, TOY, mlp_onnx
+from conftest import GAIN, QUICK, TOY, mlp_onnx
 
 import fdtasil
 from fdtasil import Fit
-from fdtasil.errors import FdtasilWarning, SettingError
+from fdtasil.errors import ExpertError, FdtasilWarning, SettingError
 from fdtasil.run.folder import RunFolder
 
 FILES = (
@@ -192,3 +193,58 @@ def test_stopped_while_the_probes_are_asked_nothing_is_lost(kept, tmp_path, monk
     assert blocks == 4 - kept
     assert read(tmp_path / "run") == read(tmp_path / "whole")
     assert resumed.queries == whole.queries
+
+
+class WithDerivatives:
+    """A linear law that says its own derivatives."""
+
+    def predict(self, observations, deterministic=True):
+        return observations @ GAIN.T, None
+
+    def jacobian(self, observations):
+        return np.broadcast_to(GAIN, (len(observations), *GAIN.shape))
+
+
+@pytest.mark.fault(236)
+@pytest.mark.parametrize("count", [3, 5])
+def test_own_derivatives_are_compared_once_over_interruptions(count, tmp_path):
+    run = {**RUN, "probes": "jacobian"}
+    whole = fdtasil.distill(WithDerivatives(), TOY, out=tmp_path / "golden", **run)
+    with pytest.raises(Stop):
+        fdtasil.distill(
+            WithDerivatives(), TOY, out=tmp_path / "run", callback=stop_at(count), **run
+        )
+    most = sum(whole.queries.values())
+    result = fdtasil.distill(
+        WithDerivatives(), TOY, resume=tmp_path / "run", max_queries=most, **run
+    )
+    assert result.queries == whole.queries
+    assert result.student.to_bytes() == whole.student.to_bytes()
+
+
+@pytest.mark.fault(237)
+def test_a_warning_is_not_said_again_when_probes_are_asked_on(tmp_path, monkeypatch):
+    """Stopped while they are asked; the warning is of where they are asked."""
+    monkeypatch.setattr(RunFolder, "due", property(lambda folder: folder._path is not None))
+    run = {**QUICK, "episodes": 8, "horizon": 40, "probes": "sphere:10,raw,radius=1.2e-7"}
+    asked = 0
+
+    def law(rows):
+        nonlocal asked
+        asked += len(rows)
+        if asked > limit:
+            raise TimeoutError("too late")
+        return rows @ GAIN.T
+
+    limit = np.inf
+    with pytest.warns(FdtasilWarning, match="rounds away"):
+        whole = fdtasil.distill(law, TOY, out=tmp_path / "golden", **run)
+    limit, asked = sum(whole.queries.values()) - 1200, 0
+    with pytest.raises(ExpertError), pytest.warns(FdtasilWarning):
+        fdtasil.distill(law, TOY, out=tmp_path / "run", **run)
+    assert list((tmp_path / "run" / "checkpoints").rglob("asked-*"))
+    limit = np.inf
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        result = fdtasil.distill(law, TOY, resume=tmp_path / "run", **run)
+    assert result.report["warnings"] == whole.report["warnings"]

@@ -6,6 +6,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from conftest import GAIN
 from toy_environments import Integrator
 from toy_tasks import linear_task, stream
 
@@ -108,3 +109,52 @@ def test_a_single_coordinate_far_from_zero_is_warned_of():
     )
     with EnvironmentPool(clock) as pool, pytest.warns(FdtasilWarning, match="how 1 of the 3"):
         rollout(follow(lambda rows: 0 * rows[:, :1]), pool, [1, 2], 30)
+
+
+class InUnits(gymnasium.ObservationWrapper):
+    """Metres of altitude beside radians of an angle: one law, other units."""
+
+    def __init__(self, units):
+        super().__init__(Integrator())
+        self.units = np.asarray(units)
+
+    def observation(self, observation):
+        return (observation * self.units).astype(np.float32)
+
+
+@pytest.mark.fault(230)
+@pytest.mark.parametrize("probes", [0, 5])
+def test_a_coordinate_in_small_units_is_seen_and_probed(probes):
+    def error(units):
+        def law(rows):
+            return np.tanh(rows / np.asarray(units, np.float32) @ GAIN.T)
+
+        run = {"episodes": 3, "horizon": 40, "fit": Fit(steps=400), "student": Mlp(32)}
+        result = fdtasil.distill(
+            law, lambda: InUnits(units), probes, evaluation_episodes=2, progress=False, **run
+        )
+        assert result.report["frozen_coordinates"] == 1  # the constant one
+        return result.evaluation.action_error
+
+    usual = error([1.0, 1.0, 1.0, 1.0, 1.0])
+    with pytest.warns(FdtasilWarning, match=r"1 coordinates deviate by less .* \(2: "):
+        small = error([1e4, 1e4, 1e-3, 1e4, 1.0])
+    assert small == pytest.approx(usual, rel=0.2)
+
+
+@pytest.mark.fault(230)
+def test_dust_is_no_movement():
+    states = np.random.default_rng(0).standard_normal((100, 3)) * [1.0, 2.0, 1e-14]
+    scales = measure_scales(states)
+    assert scales.live.tolist() == [True, True, False]
+    assert scales.scale[2] == 1.0
+
+
+@pytest.mark.fault(231)
+def test_bounds_as_large_as_float32_are_none():
+    largest = float(np.finfo(np.float32).max)
+    states = np.random.default_rng(0).standard_normal((60, 5)).astype(np.float32)
+    data = fdtasil.from_arrays(states, states @ GAIN.T, low=-largest, high=largest)
+    result = fdtasil.distill(None, None, 0, dataset=data, student=Mlp(8), fit=Fit(steps=200))
+    assert not np.isfinite(result.student.low.numpy()).any()
+    assert result.history[-1]["action_error"] < 0.9 * result.history[0]["action_error"]

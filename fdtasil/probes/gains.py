@@ -155,20 +155,20 @@ def _law(
     steps[np.arange(_RAYS), axes] = units[axes]
     slopes = np.stack([_slope(expert, states, steps * rung) / rung for rung in _RUNGS])
     moving = np.array([_moves(states, steps * rung).all() for rung in _RUNGS])
-    if not moving[-1]:
+    if not moving[-2:].all():
         raise SettingError(
             f"scale from {units.min():g} of observations up to {np.abs(rows).max():g}",
             "units that float32 does not round away there",
             "raise scale, or leave it out",
         )
+    slopes, rungs = slopes[moving.argmax() :], _RUNGS[moving.argmax() :]
     apart = np.nanmean(np.diff(slopes, axis=0) ** 2, axis=1)  # (rungs - 1, m)
     sizes = np.nanmean(slopes[1:] ** 2 + slopes[:-1] ** 2, axis=1)
-    wide = _RUNGS[1:]
+    wide = rungs[1:]
     law = np.stack([(1 + _RATIO**2) / wide**2, (1 - _RATIO**-2) ** 2 * wide**4], axis=1)
     noise, curvature = np.zeros((2, apart.shape[1]))
     for action, (squares, size) in enumerate(zip(apart.T, sizes.T, strict=True)):
-        # Steps smaller than those of the expert, or of float32, say nothing.
-        told = (size > 0) & moving[:-1]
+        told = size > 0  # steps smaller than those of the expert say nothing
         if not told.any():
             continue
         # Differences that agree to the bit agree to float32's rounding, and no better.
@@ -180,7 +180,7 @@ def _law(
         lengths = np.linalg.norm(design, axis=0)  # the columns lie twenty powers of ten apart
         fitted, _ = nnls(design / lengths, np.ones(len(design)))
         noise[action], curvature[action] = np.sqrt(fitted / lengths)
-    return noise, curvature, 2 * float(_RUNGS[moving.argmax()])
+    return noise, curvature, 2 * float(rungs[0])
 
 
 def _best_radius(noise: np.ndarray, curvature: np.ndarray, nearest: float) -> float:

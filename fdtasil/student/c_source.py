@@ -235,6 +235,10 @@ int main(void)
             if (i < STUDENT_OBSERVATIONS)
                 observation[i] = value;
         }
+        if (i == 0 && ahead() == '\\n') {
+            getchar();
+            continue;
+        }
         if (i != STUDENT_OBSERVATIONS || (ahead() != '\\n' && ahead() != EOF)) {
             fprintf(stderr, "line %d: expected %d numbers with blanks between\\n", line,
                     STUDENT_OBSERVATIONS);
