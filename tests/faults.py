@@ -264,6 +264,7 @@ FAULTS = {
         243: "rounding beside an offset, taken for noise",
         244: "a number where a file for robots expects an observation",
         245: "a line of too few or too many numbers, for the program in C",
+        246: "an expert that is gone, and asked row by row",
     },
 }
 

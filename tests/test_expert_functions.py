@@ -447,3 +447,37 @@ def test_an_output_of_what_has_none():
         fdtasil.load_expert(lambda rows: rows[:, :2], 5, 2, output="u").ask(
             np.zeros((2, 5)), "check"
         )
+
+
+@pytest.mark.fault(246)
+def test_an_expert_that_is_gone_is_not_asked_a_thousand_times_more():
+    calls, gone = 0, False
+
+    def far_away(rows):
+        nonlocal calls
+        calls += 1
+        if gone:
+            raise RuntimeError("no route to the host")
+        return rows[:, :2]
+
+    expert = fdtasil.load_expert(far_away, 5, 2)
+    expert.ask(np.ones((4, 5), np.float32), "act")
+    gone, calls = True, 0
+    with pytest.raises(ExpertError, match="no route to the host"):
+        expert.ask(np.ones((1000, 5), np.float32), "probe")
+    assert calls == 1 + 8 + 1
+
+
+def test_many_rows_without_an_answer_are_none_where_others_have_one():
+    def limited(rows):
+        if (rows[:, 0] > 0).any():
+            raise ValueError("infeasible")
+        return rows[:, :2]
+
+    expert = fdtasil.load_expert(limited, 5, 2)
+    rows = np.ones((100, 5), np.float32)
+    rows[80:] = -1
+    expert.ask(rows[90:], "act")
+    answers = expert.ask(rows, "probe")
+    assert np.isnan(answers[:80]).all()
+    assert (answers[80:] == -1).all()

@@ -509,3 +509,37 @@ def test_bounds_of_padding_are_no_spread(probes):
 def test_derivatives_are_not_asked_anew():
     with pytest.raises(SettingError, match="resample with exact derivatives"):
         Probes.parse("jacobian,resample")
+
+
+class Named(Integrator):
+    """A dictionary of its observation's parts."""
+
+    def __init__(self):
+        super().__init__()
+        box = gymnasium.spaces.Box
+        sizes = {"constant": 1, "position": 2, "velocity": 2}
+        self.observation_space = gymnasium.spaces.Dict(
+            {name: box(-np.inf, np.inf, (size,)) for name, size in sizes.items()}
+        )
+
+    def _observe(self):
+        names = {"constant": [3.0], "position": self.position, "velocity": self.velocity}
+        return {name: np.asarray(part, np.float32) for name, part in names.items()}
+
+
+@pytest.mark.parametrize("spread", [{"constant": 0.5, 1: 2.0}, "constant:0.5,1:2.0"])
+def test_a_spread_of_a_part_is_said_by_its_name(spread):
+    law = lambda seen: -0.3 * (seen["position"] + seen["velocity"])  # noqa: E731
+    result = fdtasil.distill(law, Named, 3, spread=spread, **QUICK)
+    assert result.settings["spread"] == {"0": 0.5, "1": 2.0}
+    with pytest.raises(SettingError, match="constant, position, velocity"):
+        fdtasil.distill(law, Named, 3, spread={"goal": 1.0}, **QUICK)
+
+
+def test_a_budget_says_how_many_probes_fit():
+    source = "sphere:{},forward,raw,radius=0.1"
+    with pytest.raises(SettingError, match="7 probes fit; or lower episodes"):
+        fdtasil.distill(linear, TOY, source.format(9), max_queries=800, **QUICK)
+    fdtasil.distill(linear, TOY, source.format(7), max_queries=800, **QUICK)
+    with pytest.raises(SettingError, match="7 probes fit"):
+        fdtasil.distill(linear, TOY, source.format(8), max_queries=800, **QUICK)

@@ -6,7 +6,7 @@ import gymnasium
 import numpy as np
 import onnx
 import pytest
-from conftest import QUICK, TOY
+from conftest import GAIN, QUICK, TOY
 from onnx import TensorProto, helper, numpy_helper
 from toy_environments import Integrator
 
@@ -282,3 +282,26 @@ def test_inspect_and_gains_take_it_too(file, inside):
     shown = inside("gains", file, TOY, "--states", 3, "--horizon", 20)
     assert shown.returncode == 0, shown.stderr
     assert "Jacobians of 2 x 11" in shown.stdout
+
+
+class WithDictionary:
+    """Remembers two things by their names."""
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        rows = len(observation)
+        if state is None:
+            state = {"sum": np.zeros((rows, 2)), "last": np.zeros((rows, 5))}
+        begun = np.reshape(episode_start, (-1, 1))
+        before = {name: np.where(begun, 0, part) for name, part in state.items()}
+        total = 0.5 * before["sum"] + (observation - 0.1 * before["last"]) @ GAIN.T
+        return total, {"sum": total, "last": observation.copy()}
+
+
+def test_a_memory_may_be_a_dictionary():
+    expert = fdtasil.load_expert(WithDictionary(), 5)
+    assert expert.memory.size == 7
+    rows = np.random.default_rng(0).standard_normal((3, 5)).astype(np.float32)
+    first, kept = expert.memory.step(rows, np.zeros((3, 7), np.float32))
+    second, _ = expert.memory.step(rows, kept)
+    assert first == pytest.approx(rows @ GAIN.T, abs=1e-5)
+    assert second == pytest.approx(0.5 * first + 0.9 * rows @ GAIN.T, abs=1e-5)

@@ -215,9 +215,14 @@ class Expert:
         if raised.everywhere:
             raise raised.error
         self.count(len(rows) if len(rows) > 1 else 0, "check")
-        found: list[np.ndarray | None] = [None]
-        if len(rows) > 1:
-            found = [self._asked_alone(row[None], ask) for row in rows]
+        found: list[np.ndarray | None] = [None] if len(rows) == 1 else []
+        silent = 0  # in a row, up to here
+        for row in rows if len(rows) > 1 else ():
+            found.append(self._asked_alone(row[None], ask))
+            silent = silent + 1 if found[-1] is None else 0
+            # Seconds each, where it waits for a server or a solver that is gone.
+            if silent in _DOUBTED and self.silence.answered is not None:
+                self._check_control(ask, raised.error)
         answered = [answer for answer in found if answer is not None]
         if len(answered) == len(rows):
             raise raised.error  # of the batch, not of a row
@@ -315,6 +320,8 @@ class _Raised(Exception):
         return cls(whole, f"{kind}: {said}", everywhere=kind in _NOT_OF_A_ROW)
 
 
+_DOUBTED = (8, 64, 512)
+"""Rows in a row without an answer, after which it is asked what it has answered before."""
 _NOT_OF_A_ROW = {"MemoryError", "TimeoutError", "RecursionError"}
 
 

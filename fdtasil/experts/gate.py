@@ -195,8 +195,8 @@ def raise_problems(findings: Sequence[Finding], *, force: bool) -> None:
 
 _STOCHASTIC = (
     "equal answers to equal observations, without noise, and without memory of earlier ones",
-    "export the deterministic policy (its mean), without a hidden state; or pass force=True "
-    "(--force on the command line) to go on as it is",
+    "export the deterministic policy (its mean); what remembers says so with predict("
+    "observations, state, episode_start) -> (actions, state); or pass force=True (--force)",
 )
 _LARGE = (
     "the same answers in batches of any size",

@@ -221,7 +221,8 @@ def _kind_of(source: object) -> "Kind":
     raise ExpertError(
         f"expert is a {type(source).__name__}",
         "an ONNX path, a torch module, an object with predict, or a function on batches",
-        "wrap it: lambda observations: ...  ((B, n) -> (B, m))",
+        "wrap it: lambda observations: ...  ((B, n) -> (B, m)); what remembers has "
+        "predict(observations, state, episode_start) -> (actions, state)",
     )
 
 

@@ -81,8 +81,8 @@ class _Predicts:
         if state is not None:
             raise ExpertError(
                 f"{self.name} returns a state beside its actions",
-                "a policy without memory",
-                "distil a policy that depends on the observation only",
+                "a state of arrays whose rows are those of the observations, zeros at the start",
+                "return such arrays, a tuple or a dictionary of them, or None for no memory",
             )
         return actions
 
@@ -132,7 +132,9 @@ def _ask_first(source: Any, rows: int, n: int, options: Mapping[str, bool]) -> A
 
 
 def _leaves(state: Any) -> list[np.ndarray]:
-    """Return the arrays of a state: one, or a tuple of them."""
+    """Return the arrays of a state: one, or a tuple or dictionary of them."""
+    if isinstance(state, Mapping):
+        state = tuple(state.values())
     return [np.asarray(part) for part in (state if isinstance(state, tuple | list) else (state,))]
 
 
@@ -180,7 +182,11 @@ class _Carries:
             moved = memories[:, start:stop].reshape(rows, *shape).astype(part.dtype)
             parts.append(np.ascontiguousarray(np.moveaxis(moved, 0, axis)))
             start = stop
-        state = tuple(parts) if isinstance(self.like, tuple | list) else parts[0]
+        state: Any = parts[0]
+        if isinstance(self.like, Mapping):
+            state = dict(zip(self.like, parts, strict=True))
+        elif isinstance(self.like, tuple | list):
+            state = tuple(parts)
         begun = np.zeros(rows, bool)
         actions, after = self.source.predict(
             observations, state=state, episode_start=begun, **self.options

@@ -9,12 +9,13 @@ import numpy as np
 from fdtasil.checks import check_count, check_number, spelt
 from fdtasil.errors import SettingError
 from fdtasil.probes.scales import ROUNDING
+from fdtasil.rollouts.spaces import Layout
 
 __all__ = ["Spread", "SpreadLike", "stands_still"]
 
-SpreadLike = Mapping[int, float] | str
-"""Coordinate -> the deviation that it is probed by, as a text "3:0.5,7:0.1" too; or "bounds", the
-deviations of uniform values in the bounds of the observations."""
+SpreadLike = Mapping[int, float] | Mapping[str, float] | Mapping[int | str, float] | str
+"""Coordinate, or name of a part -> the deviation that it is probed by, as a text "3:0.5,goal:0.1"
+too; or "bounds", the deviations of uniform values in the bounds of the observations."""
 
 _STILL = 1e-3  # of what a coordinate varies between episodes, that it may vary within one
 _EXPECTED = 'a deviation for each coordinate, or "bounds"'
@@ -35,7 +36,12 @@ class Spread:
 
     @classmethod
     def of(
-        cls, given: SpreadLike | None, low: np.ndarray | None, high: np.ndarray | None, n: int
+        cls,
+        given: SpreadLike | None,
+        low: np.ndarray | None,
+        high: np.ndarray | None,
+        n: int,
+        layout: Layout | None = None,
     ) -> "Spread":
         """Read the argument `spread`.
 
@@ -44,6 +50,7 @@ class Spread:
             low: (n,) bounds of the observations, or None where there is no environment.
             high: (n,) upper bounds.
             n: Length of an observation.
+            layout: What its parts are called.
 
         Raises:
             SettingError: If it can't be used.
@@ -53,7 +60,12 @@ class Spread:
         if isinstance(given, str) and given != "bounds":
             given = _read(given)
         if isinstance(given, Mapping):
-            return cls(dict(sorted(_checked(key, value, n) for key, value in given.items())))
+            columns = [
+                (column, value)
+                for key, value in given.items()
+                for column in (_columns(key, layout) if isinstance(key, str) else (key,))
+            ]
+            return cls(dict(sorted(_checked(column, value, n) for column, value in columns)))
         if not isinstance(given, str):
             raise SettingError(spelt("spread", given), _EXPECTED, _EXAMPLE)
         if (
@@ -91,11 +103,28 @@ def _checked(coordinate: object, deviation: object, n: int) -> tuple[int, float]
         raise SettingError(f"spread: {error.found}", error.expected, _EXAMPLE) from None
 
 
-def _read(text: str) -> dict[int, float]:
-    """Read "3:0.5,7:0.1"."""
+def _columns(name: str, layout: Layout | None) -> tuple[int, ...]:
     try:
-        pairs = [part.split(":") for part in text.split(",")]
-        read = {int(coordinate): float(deviation) for coordinate, deviation in pairs}
+        return layout.columns(name) if layout else {}[name]
+    except KeyError:
+        known = ", ".join(layout.names) if layout else ""
+        raise SettingError(
+            spelt("spread", {name: "..."}),
+            f"names of parts of the observation: {known or 'it has none'}",
+            "write these names, or numbers" if known else _EXAMPLE,
+        ) from None
+
+
+def _read(text: str) -> dict[int | str, float]:
+    """Read "3:0.5,goal:0.1"."""
+    try:
+        pairs = [part.rpartition(":")[::2] for part in text.split(",")]
+        read = {
+            int(one) if one.isdigit() else one.strip(): float(deviation)
+            for one, deviation in pairs
+        }
+        if "" in read:
+            raise ValueError("a deviation of nothing")
         if len(read) < len(pairs):
             raise ValueError("a coordinate twice")
         return read

@@ -85,8 +85,8 @@ class Condition:
         return all(measured <= allowed for _, measured, allowed in self.asked)
 
     def __str__(self) -> str:
-        said = (f"{name} {here:.2g} (allowed {most:.2g})" for name, here, most in self.asked)
-        end = f"distance at most {self.promised:.2g}" if self.met else "not met"
+        said = (f"{name} is {here:.2g} (allowed {most:.2g})" for name, here, most in self.asked)
+        end = f"met, distance at most {self.promised:.2g}" if self.met else "not met"
         return f"{self.source}: {', '.join(said)}; {end}"
 
 

@@ -9,11 +9,13 @@ from fdtasil.experts.expert import Expert
 from fdtasil.probes.scales import Scales
 from fdtasil.rollouts.behaviours import Policy, has_none
 
-__all__ = ["Fidelity", "fidelity_of"]
+__all__ = ["GOOD", "USUAL", "Fidelity", "fidelity_of"]
 
 RADII = (0.03, 0.1, 0.3, 1.0)
 USUAL = 0.3
 """Radius at which differences are compared in one number."""
+GOOD = "students at their expert's return have 20 to 60 %, plain copies that fail 95 to 110 %"
+"""What that number was on eight experts (benchmarks/figures/fidelity.md)."""
 _DIRECTIONS = 8
 
 

@@ -4,7 +4,9 @@ from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
 
-from fdtasil.errors import shown
+import gymnasium
+
+from fdtasil.errors import in_one_line, shown
 from fdtasil.experts.expert import rows_text
 from fdtasil.results.size import size_text
 from fdtasil.student.fit import Fit
@@ -43,13 +45,21 @@ def run_rows(report: Mapping[str, Any]) -> Rows:
 def call_of(settings: Mapping[str, Any], history: int) -> str:
     """Return the call of a run, as far as its settings say it.
 
-    What an expert, an environment or a dataset is made with, and functions, stand in no file.
+    What an expert, an environment or a dataset is made with, and functions, stand in no file:
+    they are named, and left to the reader.
 
     Args:
         settings: Of the run's configuration.
         history: How many observations the student sees.
     """
-    given = [repr(settings["expert"]), repr(settings["env"])]
+    given, lost = [], []
+    for name, found in (
+        ("expert", settings.get("expert_sha256") or _is_address(settings["expert"])),
+        ("env", _is_registered(settings["env"])),
+    ):
+        said = settings[name]
+        given.append(repr(said) if found or said is None else name)
+        lost += [] if given[-1] != name else [f"{name} = ...  # {in_one_line(str(said))}\n"]
     probes = settings["probes"]
     given.append("0" if probes == "none" else repr(probes))
     plain = {name: settings.get(name) for name in ("trainer", "episodes", "horizon", "seed")}
@@ -73,4 +83,14 @@ def call_of(settings: Mapping[str, Any], history: int) -> str:
     told = ", ".join(f"{name}={fit[name]}" for name in names)
     given.append(f"fit=fdtasil.Fit({told})")
     inside = ",\n".join(f"    {one}" for one in given)
-    return f"import fdtasil\n\nresult = fdtasil.distill(\n{inside},\n)\n"
+    made = "".join([*lost, "\n"]) if lost else ""
+    return f"import fdtasil\n\n{made}result = fdtasil.distill(\n{inside},\n)\n"
+
+
+def _is_address(name: object) -> bool:
+    return isinstance(name, str) and name.startswith(("http://", "https://", "hf://"))
+
+
+def _is_registered(name: object) -> bool:
+    """Whether gymnasium makes an environment of that name, once its module is imported."""
+    return isinstance(name, str) and (":" in name or name in gymnasium.registry)

@@ -258,7 +258,7 @@ def resolve_horizon(horizon: int | None, pool: EnvironmentPool) -> int:
     limit = pool.time_limit
     if horizon is None and limit is None:
         raise SettingError(
-            f"no horizon for {pool.name}, which has no time limit of its own",
+            f"no horizon for {pool.name}, whose episodes no TimeLimit ends",
             "a positive number of steps",
             "write for example horizon=300",
         )

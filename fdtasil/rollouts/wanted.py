@@ -51,9 +51,9 @@ class Environment:
         if not isinstance(self.environment, str) and (self.kwargs or self.num_envs):
             name = "kwargs" if self.kwargs else "num_envs"
             raise SettingError(
-                f"{name}= of a {type(self.environment).__name__}",
-                "an id, which is still to be made",
-                f"leave {name}= out, and make the environment so",
+                f"{name}= with env= that is no id",
+                "an id of gymnasium, which is made with it",
+                "pass a function that makes it so, such as lambda: MyEnv(limit=50)",
             )
 
     def factory(self) -> Callable[[], Any]:

@@ -163,7 +163,8 @@ class Arguments:
     def _spread(self, subject: Subject) -> Spread:
         boxes = subject.pool.boxes if subject.pool else None
         low, high = (boxes.observation_low, boxes.observation_high) if boxes else (None, None)
-        return Spread.of(self.spread, low, high, subject.observation_size)
+        layout = subject.spaces.observations if subject.spaces else None
+        return Spread.of(self.spread, low, high, subject.observation_size, layout)
 
 
 def read_arguments(

@@ -2,7 +2,7 @@
 
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 from fdtasil.demonstrations.trainers import Trainer, describe_trainer
@@ -223,8 +223,20 @@ class Configuration:
         raise SettingError(
             f"this run may ask the expert {total:,} times ({rows_text(predicted)})",
             f"at most max_queries={self.max_queries:,}",
-            "lower probes, episodes, horizon or evaluation_episodes, or raise max_queries",
+            f"{self._fewer()}lower episodes, horizon or evaluation_episodes, or raise max_queries",
         )
+
+    def _fewer(self) -> str:
+        """Return the largest number of probes that the budget allows, as advice."""
+        source = self.probes
+        if source is None or not (asked := getattr(source.directions, "probes", None)):
+            return ""
+        for count in range(asked - 1, 0, -1):
+            directions: Any = replace(source.directions, probes=count)  # pyright: ignore
+            fewer = replace(self, probes=replace(source, directions=directions))
+            if sum(fewer.predicted_queries().values()) <= (self.max_queries or 0):
+                return f"{count} probes fit; or "
+        return ""
 
     def to_json(self) -> dict[str, Any]:
         """Return the configuration as plain JSON values, every field of it."""

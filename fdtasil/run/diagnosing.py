@@ -15,7 +15,7 @@ from fdtasil.files.plain import to_plain
 from fdtasil.probes.scales import measure_scales
 from fdtasil.progress import Progress
 from fdtasil.results.conditions import Condition, Errors, conditions_of, errors_of
-from fdtasil.results.fidelity import Fidelity, fidelity_of
+from fdtasil.results.fidelity import GOOD, USUAL, Fidelity, fidelity_of
 from fdtasil.results.linearisation import Linearisation, linearise
 from fdtasil.results.stability import Stability, distances, stability_of
 from fdtasil.rollouts.behaviours import Policy, follow
@@ -76,7 +76,11 @@ class Diagnosis:
 
     def __str__(self) -> str:
         found, loop = self.fidelity, self.stability
-        lines = ["derivatives, error relative to the expert's own differences (expert's noise)"]
+        lines = [
+            f"its reactions are off by {found.error:.0%} of its expert's at a radius of {USUAL}; "
+            f"{GOOD}",
+            "derivatives, error relative to the expert's own differences (expert's noise)",
+        ]
         for radius, error, floor in zip(found.radii, found.errors, found.floors, strict=True):
             lines.append(f"  radius {radius:<5g} {error:8.1%}   ({floor:.1%})")
         lines.append(f"  actions      {found.action_error:8.1%}   of how the expert's vary")

@@ -138,7 +138,7 @@ def distill(
         constraints: Name -> function of (N, n) observations and the (N, m) actions taken there,
             positive where the constraint is violated; the evaluation counts these steps.
         max_queries: Refuse to start a run that may ask the expert more often; where `probes` are
-            left out, they are those that it allows.
+            left out, "fresh" is taken only if it allows that.
         device: Where the student is trained: "cpu", "cuda", "cuda:N".
         force: Go on with a warning where the expert fails the gate but answers.
         out: Folder of the run: checkpoints while it goes on, then all its files. It is missing,

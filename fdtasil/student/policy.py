@@ -178,7 +178,7 @@ class Student(nn.Module):
             raise SettingError(
                 f"observation of shape {rows.shape}",
                 f"({n},) or (B, {n})",
-                "pass raw observations",
+                "pass raw observations; of a student with a history, ask fdtasil.History",
             )
         actions = self.answer(np.atleast_2d(rows))
         return (actions[0] if rows.ndim == 1 else actions), state
