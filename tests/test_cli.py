@@ -390,3 +390,18 @@ def test_no_other_file_of_the_current_folder_is_run(expert, tmp_path):
     done = subprocess.run(command, capture_output=True, text=True, cwd=tmp_path, env=environment)
     assert done.returncode == 0, done.stderr
     assert "CODE OF THE FOLDER" not in done.stdout + done.stderr
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--horizon", "ten"], "fdtasil: --horizon 'ten'\n  expected: INT\n"),
+        (["--hidden", "32,32"], "fdtasil: --hidden '32,32'\n  expected: [INT [INT ...]]\n"),
+        (["--weight", "much"], "fdtasil: --weight 'much'\n  expected: FLOAT\n"),
+    ],
+)
+def test_a_word_that_is_no_number_takes_three_lines(words, said, inside):
+    done = inside("distill", "e.onnx", TOY, *words)
+    assert done.returncode == 2
+    assert done.stderr.startswith(said)
+    assert len(done.stderr.splitlines()) == 3

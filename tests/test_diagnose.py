@@ -140,10 +140,39 @@ def test_better_students_have_better_derivatives(tmp_path):
     assert spearmanr(returns, errors).statistic == pytest.approx(1.0)
 
 
+@pytest.mark.parametrize(
+    "student_obs",
+    [None, [3, 2, 1, 0], lambda rows: rows[:, ::-1]],
+    ids=["whole", "some", "function"],
+)
+def test_a_result_and_its_folder_are_students(student_obs, tmp_path):
+    expert, run = linear(GAIN), {"episodes": 2, "horizon": 30, "evaluation_episodes": 2}
+    result = fdtasil.distill(
+        expert, TOY, "3,forward", student_obs=student_obs, student=fdtasil.Mlp(8),
+        fit=fdtasil.Fit(steps=30), **run,
+    )  # fmt: skip
+    look = {"episodes": 2, "horizon": 20, "progress": False}
+    found = fdtasil.diagnose(result, expert, TOY, **look)
+    own = fdtasil.diagnose(result.view.policy(result.student.act), expert, TOY, **look)
+    assert found.fidelity == own.fidelity
+    folder = result.save(tmp_path)
+    if callable(student_obs):
+        with pytest.raises(SettingError, match="no file can hold"):
+            fdtasil.diagnose(folder, expert, TOY, **look)
+        return
+    assert fdtasil.diagnose(str(folder), expert, TOY, **look).fidelity == found.fidelity
+    judged = fdtasil.evaluate(folder, expert, TOY, episodes=2, horizon=30)
+    assert judged == result.evaluation
+
+
 def test_what_can_not_be_diagnosed():
     chosen = in_form(linear(GAIN), "box", "choice")
     with pytest.raises(SettingError, match="choices"):
         fdtasil.diagnose(chosen, chosen, lambda: InForm("box", "choice"), horizon=10)
+    run = {"episodes": 2, "horizon": 20, "evaluation_episodes": 0, "fit": fdtasil.Fit(steps=5)}
+    remembers = fdtasil.distill(linear(GAIN), TOY, 0, history=2, **run)
+    with pytest.raises(SettingError, match="sees 2 observations"):
+        fdtasil.diagnose(remembers, linear(GAIN), TOY, horizon=20)
 
 
 def test_the_command(tmp_path, inside):

@@ -15,6 +15,7 @@ from fdtasil.files.plain import to_plain
 from fdtasil.probes.scales import measure_scales
 from fdtasil.progress import Progress
 from fdtasil.results.conditions import Condition, Errors, conditions_of, errors_of
+from fdtasil.results.distilled import Distilled
 from fdtasil.results.fidelity import GOOD, USUAL, Fidelity, fidelity_of
 from fdtasil.results.linearisation import Linearisation, linearise
 from fdtasil.results.stability import Stability, distances, stability_of
@@ -26,10 +27,10 @@ from fdtasil.rollouts.environments import (
     simulator_warnings,
 )
 from fdtasil.rollouts.rollout import rollout
-from fdtasil.run.judging import judged_in
+from fdtasil.run.judging import judged_in, judged_through
 from fdtasil.run.subject import visible
 from fdtasil.seeding import episode_seeds, generator
-from fdtasil.student.view import View
+from fdtasil.student.view import View, view_size
 
 __all__ = ["Diagnosis", "diagnose"]
 
@@ -112,7 +113,7 @@ class Diagnosis:
 
 
 def diagnose(
-    student: ExpertLike,
+    student: ExpertLike | Distilled,
     expert: ExpertLike,
     env: EnvironmentLike,
     *,
@@ -124,7 +125,8 @@ def diagnose(
 ) -> Diagnosis:
     """Measure how well a student's derivatives are its expert's, and what the expert forgives.
 
-    Nothing is trained, and the student may be anybody's: a `Student`, an ONNX file, a function.
+    Nothing is trained, and the student may be anybody's: a result or the folder of a run, an ONNX
+    file, a function.
     The expert is asked some thousand times beside its episodes, and 48 times more for each
     coordinate where its loop follows a law.
 
@@ -133,7 +135,7 @@ def diagnose(
     path is exact for a law that does, and the measured errors are those of one path.
 
     Args:
-        student: Who is looked at.
+        student: Who is looked at: as `policy` of `evaluate`.
         expert: Who it is to be like.
         env: As in `distill`.
         episodes: From as many starts.
@@ -157,6 +159,11 @@ def diagnose(
     """
     count, bars = check_count("episodes", episodes, 2), Progress(check_flag("progress", progress))
     check_count("seed", seed, 0, 2**32 - 1)
+    looked_at, student_obs, history = judged_through(student, None, 1)
+    if history > 1:
+        raise SettingError(
+            f"a student that sees {history} observations", "one that sees one", "see evaluate()"
+        )
     with EnvironmentPool(env) as pool, torch_settings(torch.device("cpu")):
         if pool.spaces.actions.choices:
             raise SettingError(
@@ -166,7 +173,7 @@ def diagnose(
             )
         n, length = pool.boxes.observation_size, resolve_horizon(horizon, pool)
         asked = expert_in(expert, pool)
-        judged = judged_in(student, pool, n, whole=True)
+        judged = judged_in(looked_at, pool, view_size(student_obs, n), whole=student_obs is None)
         if asked.memory is not None or judged.memory is not None:
             raise SettingError(
                 "a policy with a memory", "two that depend on the observation", "see evaluate()"
@@ -174,7 +181,8 @@ def diagnose(
         starts = episode_seeds(seed, "evaluation", 0, count)
         own = examine(asked, pool, starts, length, bars, force=False)
         visited = own.observations[own.valid]
-        view = View.of(visible(judged.columns, n, 0), visited[:256])
+        seen = judged.columns if student_obs is None else student_obs
+        view = View.of(visible(seen, n, 0), visited[:256])
         act = view.policy(sized(judged, view.size, pool.boxes.action_size).policy("check"))
         scales, boxes = measure_scales(visited), pool.boxes
         with np.errstate(invalid="ignore"):  # of infinite bounds, which are not chosen

@@ -1,12 +1,42 @@
 """A policy that is judged, opened for an environment."""
 
+from pathlib import Path
+
 from fdtasil.experts.expert import Expert, Hints
 from fdtasil.experts.load import ExpertLike, open_expert
+from fdtasil.experts.onnx_expert import said_history
 from fdtasil.experts.structure import in_spaces
+from fdtasil.results.distilled import Distilled
 from fdtasil.rollouts.environments import EnvironmentPool
 from fdtasil.rollouts.spaces import Spaces, flat_layout
+from fdtasil.student.view import StudentObservation
 
-__all__ = ["judged_in"]
+__all__ = ["judged_in", "judged_through"]
+
+
+def judged_through(
+    policy: ExpertLike | Distilled, student_obs: StudentObservation | None, history: int
+) -> tuple[ExpertLike, StudentObservation | None, int]:
+    """Return a policy with what it sees; a result, a run's folder and its ONNX file say it.
+
+    Args:
+        policy: The policy; a run's folder stands for its student.
+        student_obs: What the caller says that it sees, or None.
+        history: How many observations the caller says that it sees.
+
+    Raises:
+        StorageError: If the folder is a run's, and damaged.
+    """
+    if isinstance(policy, str | Path) and (Path(policy) / "student.safetensors").is_file():
+        policy = Distilled.load(policy)
+    if isinstance(policy, Distilled):
+        history = max(history, policy.steps_seen)
+        if history == 1 and student_obs is None and not policy.view.is_whole:
+            student_obs = policy.view.columns or policy.view.look
+        return policy.student, student_obs, history
+    if history == 1 and student_obs is None:
+        history = said_history(policy)
+    return policy, student_obs, history
 
 
 def judged_in(

@@ -16,7 +16,6 @@ from fdtasil.experts.examination import check_first, examine
 from fdtasil.experts.expert import Expert
 from fdtasil.experts.gate import GATE_STATES, compare_again, large_batch
 from fdtasil.experts.load import ExpertLike, expert_in, sized
-from fdtasil.experts.onnx_expert import said_history
 from fdtasil.experts.silence import Silence
 from fdtasil.probes.source import Probes
 from fdtasil.probes.spread import SpreadLike
@@ -39,7 +38,7 @@ from fdtasil.run.doubts import warn_of_idle_weights, warn_of_misfit, warn_of_sil
 from fdtasil.run.events import Callback, Event, tell_all
 from fdtasil.run.folder import asked_anew, open_run_folder
 from fdtasil.run.interrupts import heard_interrupts
-from fdtasil.run.judging import judged_in
+from fdtasil.run.judging import judged_in, judged_through
 from fdtasil.run.lesson import Lesson
 from fdtasil.run.report import config_of, no_answer, report_of
 from fdtasil.run.rounds import Rounds
@@ -244,8 +243,8 @@ def evaluate(
     """Compare a policy with an expert from the same starts.
 
     Args:
-        policy: The policy to judge: a result, a `Student`, an exported ONNX file, or anything else
-            that an expert may be.
+        policy: The policy to judge: a result, the folder of a run, a `Student`, an exported ONNX
+            file, or anything else that an expert may be.
         expert: The policy to judge it by, as in `distill`.
         env: A gymnasium id (`module:Id` too), a gymnasium environment, or a function making one.
         episodes: Number of paired episodes.
@@ -275,13 +274,7 @@ def evaluate(
     force = check_flag("force", force)
     limits = None if constraints is None else check_constraints(constraints)
     history = check_count("history", history)
-    if isinstance(policy, Distilled):
-        history = max(history, policy.steps_seen)
-        if history == 1 and student_obs is None and not policy.view.is_whole:
-            student_obs = policy.view.columns or policy.view.look
-        policy = policy.student
-    elif history == 1 and student_obs is None:
-        history = said_history(policy)
+    policy, student_obs, history = judged_through(policy, student_obs, history)
     history = check_history(history, student_obs)
     count, bars = check_count("episodes", episodes), Progress(check_flag("progress", progress))
     with EnvironmentPool(env) as pool, torch_settings(torch.device("cpu")):

@@ -73,9 +73,11 @@ def open_subject(
         EnvironmentFault: If the environment can't be used, or does not fit the demonstrations.
     """
     if given is None and (expert is None or env is None):
-        missing = "expert" if expert is None else "env"
+        missing, place = ("expert", "first") if expert is None else ("env", "second")
         raise SettingError(
-            f"no {missing}", "an expert and an environment, or a dataset", f"pass {missing}="
+            f"no {missing}",
+            "an expert and an environment, or a dataset",
+            f"pass {missing}=, in a shell as the {place} argument",
         )
     with EnvironmentPool(env) if env is not None else nullcontext() as pool:
         if pool is not None:

@@ -1,7 +1,11 @@
 """The command line: nothing heavy is loaded before it is known what is wanted."""
 
+import contextlib
 import difflib
+import functools
+import io
 import os
+import re
 import sys
 import warnings
 from collections.abc import Callable
@@ -91,10 +95,8 @@ def _plainly(shown: Callable[..., None]) -> Callable[..., None]:
 
 def _run(name: str, rest: list[str]) -> None:
     try:
-        import tyro
-
         module = import_module(f"fdtasil.shell.{name.replace('-', '_')}")
-        tyro.cli(module.command, prog=f"fdtasil {name}", args=rest, config=())
+        _read(module.command, name, rest)()
     except FdtasilError as error:
         print("\n  ".join([f"fdtasil: {error}", *_notes(error)]), file=sys.stderr)
         sys.exit(2 if isinstance(error, SettingError) else 1)
@@ -105,6 +107,34 @@ def _run(name: str, rest: list[str]) -> None:
         if _notes(error):  # of a run that was told to end
             print("; ".join(["fdtasil: terminated", *_notes(error)]), file=sys.stderr)
         raise
+
+
+def _read(command: Callable[..., None], name: str, rest: list[str]) -> Callable[[], None]:
+    """Return a command with its arguments, or say in a few lines which of them is none."""
+    import tyro
+
+    @functools.wraps(command)
+    def whole(*given: Any, **options: Any) -> Callable[[], None]:
+        return functools.partial(command, *given, **options)
+
+    said = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(said):
+            return tyro.cli(whole, prog=f"fdtasil {name}", args=rest, config=())
+    except SystemExit:
+        text = " ".join(re.sub("[\u2500-\u257f]", " ", said.getvalue()).split())
+        found = re.search(
+            r"Error parsing (\S+): no type matching (.+) could be .* from \[(.+?)\]", text
+        )
+        if found is None:
+            sys.stderr.write(said.getvalue())
+            raise
+        option, kinds, given = found.groups()
+        raise SettingError(
+            f"{option} {given}",
+            " or ".join(kind.strip("{}") for kind in kinds.split("|") if kind != "{None}"),
+            f"fdtasil {name} --help says what it is",
+        ) from None
 
 
 def _notes(error: BaseException) -> list[str]:
