@@ -639,3 +639,8 @@ def test_starts_that_differ_with_one_seed_are_warned_of():
 
     with pytest.warns(FdtasilWarning, match="same first observation twice with one seed"):
         fdtasil.distill(lambda x: 0.1 * np.tanh(x[:, :2]), Unseeded, 0, **QUICK)
+
+
+def test_a_module_that_registers_nothing_is_told_how():
+    with pytest.raises(EnvironmentFault, match=r"toy_environments must call gymnasium\.register"):
+        fdtasil.distill(run_forward, "toy_environments:Cart-v0", **QUICK)

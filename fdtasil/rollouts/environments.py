@@ -128,6 +128,12 @@ class EnvironmentPool:
             if isinstance(given, str)
             else "call it on its own; an expert comes before the environment"
         )
+        if isinstance(given, str) and ":" in given and not wanted.kwargs:
+            module, _, name = given.partition(":")
+            self._advice = (
+                f"{module} must call gymnasium.register(id={name!r}, entry_point=...) when it is "
+                "imported; in Python, the class itself does as well"
+            )
         if wanted.kwargs:
             self._advice = f"check the names in kwargs ({', '.join(map(str, wanted.kwargs))})"
         self._make = wanted.factory()
