@@ -405,3 +405,18 @@ def test_a_word_that_is_no_number_takes_three_lines(words, said, inside):
     assert done.returncode == 2
     assert done.stderr.startswith(said)
     assert len(done.stderr.splitlines()) == 3
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no such terminals")
+def test_in_a_terminal_too_with_its_colours():
+    import pty
+
+    ours, theirs = pty.openpty()
+    code = "from fdtasil.shell.main import main; main()"
+    command = [sys.executable, "-c", code, "distill", "e.onnx", TOY, "--horizon", "ten"]
+    with subprocess.Popen(command, stderr=theirs) as process:
+        os.close(theirs)
+        said = os.read(ours, 10_000).decode()
+        process.wait(60)
+    os.close(ours)
+    assert said.startswith("fdtasil: --horizon 'ten'")

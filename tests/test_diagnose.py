@@ -124,6 +124,10 @@ def test_the_bound_holds_where_the_law_does():
     assert same.gap == same.largest_error == same.fidelity.error == 0
 
 
+def never(rows):
+    raise AssertionError("asked")
+
+
 def test_better_students_have_better_derivatives(tmp_path):
     expert = linear(GAIN)
     returns, errors = [], []
@@ -156,9 +160,10 @@ def test_a_result_and_its_folder_are_students(student_obs, tmp_path):
     own = fdtasil.diagnose(result.view.policy(result.student.act), expert, TOY, **look)
     assert found.fidelity == own.fidelity
     folder = result.save(tmp_path)
-    if callable(student_obs):
-        with pytest.raises(SettingError, match="no file can hold"):
-            fdtasil.diagnose(folder, expert, TOY, **look)
+    if callable(student_obs):  # which is said before anybody plays
+        for judge in (fdtasil.diagnose, fdtasil.evaluate):
+            with pytest.raises(SettingError, match="no file can hold"):
+                judge(folder, never, TOY, **look)
         return
     assert fdtasil.diagnose(str(folder), expert, TOY, **look).fidelity == found.fidelity
     judged = fdtasil.evaluate(folder, expert, TOY, episodes=2, horizon=30)

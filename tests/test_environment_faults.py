@@ -642,5 +642,5 @@ def test_starts_that_differ_with_one_seed_are_warned_of():
 
 
 def test_a_module_that_registers_nothing_is_told_how():
-    with pytest.raises(EnvironmentFault, match=r"toy_environments must call gymnasium\.register"):
+    with pytest.raises(EnvironmentFault, match=r"must call gymnasium\.register"):
         fdtasil.distill(run_forward, "toy_environments:Cart-v0", **QUICK)

@@ -463,11 +463,22 @@ def test_fresh_is_asked_anew_beside_answers_of_fresh(expert):
     assert told.report["probes"] == usual.report["probes"] == given.probes.describe()
 
 
-def test_another_source_than_fresh_is_asked_anew_too(expert):
-    given = fdtasil.distill(expert, TOY, "sphere:4,resample", **QUICK).dataset
-    again = fdtasil.distill(expert, TOY, dataset=given, **QUICK)
-    assert again.report["probes"].startswith("sphere:4,")
-    assert "resample" in again.report["probes"]
+class Switches(torch.nn.Module):
+    """A bang-bang law."""
+
+    def forward(self, rows):
+        return torch.sign(rows @ torch.from_numpy(GAIN).T)
+
+
+@pytest.mark.parametrize("probes", [None, "sphere:4,resample"])
+def test_another_source_than_fresh_is_asked_anew_too(probes, expert):
+    """As it is stored: what a calibration found is not lost."""
+    given = fdtasil.distill(Switches(), TOY, "sphere:4,resample", **QUICK).dataset
+    assert given.probes.match == "both"
+    again = fdtasil.distill(Switches(), TOY, probes, dataset=given, **QUICK)
+    assert again.report["probes"] == given.probes.describe()
+    assert again.queries["calibrate"] == 0
+    assert again.queries["probe"] > 0
 
 
 @pytest.mark.fault(240)
@@ -507,8 +518,7 @@ def test_bounds_of_padding_are_no_spread(probes):
 
 
 def test_derivatives_are_not_asked_anew():
-    with pytest.raises(SettingError, match="resample with exact derivatives"):
-        Probes.parse("jacobian,resample")
+    assert Probes.parse("jacobian,resample") == Probes.parse("jacobian")
 
 
 class Named(Integrator):
@@ -527,11 +537,13 @@ class Named(Integrator):
         return {name: np.asarray(part, np.float32) for name, part in names.items()}
 
 
-@pytest.mark.parametrize("spread", [{"constant": 0.5, 1: 2.0}, "constant:0.5,1:2.0"])
+@pytest.mark.parametrize("spread", [{"constant": 0.5, 1: 2.0}, "constant:0.5, 1:2.0"])
 def test_a_spread_of_a_part_is_said_by_its_name(spread):
     law = lambda seen: -0.3 * (seen["position"] + seen["velocity"])  # noqa: E731
     result = fdtasil.distill(law, Named, 3, spread=spread, **QUICK)
     assert result.settings["spread"] == {"0": 0.5, "1": 2.0}
+    with pytest.raises(SettingError, match="a coordinate twice"):
+        fdtasil.distill(law, Named, 3, spread={"position": 3.0, 1: 0.1}, **QUICK)
     with pytest.raises(SettingError, match="constant, position, velocity"):
         fdtasil.distill(law, Named, 3, spread={"goal": 1.0}, **QUICK)
 

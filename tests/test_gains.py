@@ -160,6 +160,15 @@ def test_an_offset_that_float32_rounds_beside_is_no_failure(law, spread):
     assert found.jacobian[smooth, 0, 0] == pytest.approx(20 * near[smooth], abs=0.2)
 
 
+def test_a_large_constant_is_differenced_in_steps_that_float32_has():
+    rows = np.random.default_rng(0).standard_normal((20, 3))
+    rows[:, 2] = 1.7e9  # a time stamp
+    found = gains(lambda seen: np.tanh(seen[:, :1]), rows)
+    exact = 1 - np.tanh(rows[:, 0].astype(np.float32)) ** 2
+    assert found.jacobian[:, 0, 0] == pytest.approx(exact, abs=1e-3)
+    assert (found.jacobian[:, 0, 1:] == 0).all()
+
+
 def test_a_scale_that_is_rounded_away_is_refused():
-    with pytest.raises(SettingError, match="scale from 1e-12"):
+    with pytest.raises(SettingError, match="scale 1e-12 of coordinate 0"):
         gains(lambda rows: rows[:, :1], np.full((3, 2), 1e4), scale=np.full(2, 1e-12))

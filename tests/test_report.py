@@ -74,6 +74,15 @@ def test_the_call_of_the_card_repeats_the_run(further, linear):
     assert session["result"].student.to_bytes() == result.student.to_bytes()
 
 
+def test_the_call_of_a_run_on_a_dataset_names_it(quick):
+    result = fdtasil.distill(None, None, 0, dataset=quick.dataset, fit=fdtasil.Fit(steps=5))
+    block = re.search(r"```python\n(.*?)```", card_of(result), re.S)[1]
+    assert re.search(r"(?m)^dataset = \.\.\.  # sha256 \w{64}$", block)
+    session = {"dataset": quick.dataset}
+    exec(re.sub(r"(?m)^dataset = .*$", "", block), session)
+    assert session["result"].student.to_bytes() == result.student.to_bytes()
+
+
 def test_notebooks_and_pickles(quick):
     assert "<table>" in quick._repr_html_()
     assert "<table>" in quick.evaluation._repr_html_()

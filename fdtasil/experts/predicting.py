@@ -133,8 +133,8 @@ def _ask_first(source: Any, rows: int, n: int, options: Mapping[str, bool]) -> A
 
 def _leaves(state: Any) -> list[np.ndarray]:
     """Return the arrays of a state: one, or a tuple or dictionary of them."""
-    if isinstance(state, Mapping):
-        state = tuple(state.values())
+    if isinstance(state, Mapping):  # by name: in which order they come says nothing
+        state = tuple(state[name] for name in sorted(state))
     return [np.asarray(part) for part in (state if isinstance(state, tuple | list) else (state,))]
 
 
@@ -184,7 +184,7 @@ class _Carries:
             start = stop
         state: Any = parts[0]
         if isinstance(self.like, Mapping):
-            state = dict(zip(self.like, parts, strict=True))
+            state = dict(zip(sorted(self.like), parts, strict=True))
         elif isinstance(self.like, tuple | list):
             state = tuple(parts)
         begun = np.zeros(rows, bool)

@@ -8,7 +8,7 @@ from fdtasil.checks import check_count, spelt
 from fdtasil.errors import SettingError
 from fdtasil.experts.expert import Expert
 from fdtasil.experts.load import ExpertLike, load_expert
-from fdtasil.probes.scales import measure_scales
+from fdtasil.probes.scales import ROUNDING, measure_scales
 
 __all__ = ["Gains", "gain_rows", "gains"]
 
@@ -130,12 +130,20 @@ def _checked(states: object) -> np.ndarray:
 
 
 def _units(rows: np.ndarray, scale: np.ndarray | None) -> np.ndarray:
+    least = ROUNDING * np.abs(rows).max(axis=0)  # smaller steps are rounded away
     if scale is None:
-        return measure_scales(rows).units
+        return np.maximum(measure_scales(rows).units, least)
     units = np.asarray(scale, np.float64)
     if units.shape != rows.shape[1:] or not (np.isfinite(units) & (units > 0)).all():
         found = f"scale of shape {units.shape}, from {units.min(initial=0):g}"
         raise SettingError(found, f"({rows.shape[1]},) positive numbers", "leave it out")
+    if (small := np.flatnonzero(units < least)).size:
+        raise SettingError(
+            f"scale {units[small[0]]:g} of coordinate {small[0]}, whose values reach "
+            f"{np.abs(rows[:, small[0]]).max():g}",
+            "units that float32 does not round away beside them",
+            "raise that one, or leave scale out",
+        )
     return units
 
 
@@ -155,12 +163,6 @@ def _law(
     steps[np.arange(_RAYS), axes] = units[axes]
     slopes = np.stack([_slope(expert, states, steps * rung) / rung for rung in _RUNGS])
     moving = np.array([_moves(states, steps * rung).all() for rung in _RUNGS])
-    if not moving[-2:].all():
-        raise SettingError(
-            f"scale from {units.min():g} of observations up to {np.abs(rows).max():g}",
-            "units that float32 does not round away there",
-            "raise scale, or leave it out",
-        )
     slopes, rungs = slopes[moving.argmax() :], _RUNGS[moving.argmax() :]
     apart = np.nanmean(np.diff(slopes, axis=0) ** 2, axis=1)  # (rungs - 1, m)
     sizes = np.nanmean(slopes[1:] ** 2 + slopes[:-1] ** 2, axis=1)

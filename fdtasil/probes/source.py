@@ -94,12 +94,8 @@ class Probes:
                 "a finite stencil with asked directions, and none with differentiated ones",
                 'write probes="jacobian" for the exact derivative',
             )
-        if self.exact and self.resample:
-            raise SettingError(
-                "resample with exact derivatives",
-                "directions that are asked anew; a derivative stays the same",
-                'write probes="jacobian", or for example probes="sphere:10,resample"',
-            )
+        if self.exact:  # a derivative stays the same
+            object.__setattr__(self, "resample", False)
         if self.exact and self.has_labels:
             raise SettingError(
                 f"match={self.match!r} with exact derivatives",

@@ -65,7 +65,12 @@ class Spread:
                 for key, value in given.items()
                 for column in (_columns(key, layout) if isinstance(key, str) else (key,))
             ]
-            return cls(dict(sorted(_checked(column, value, n) for column, value in columns)))
+            checked = sorted(_checked(column, value, n) for column, value in columns)
+            if len(dict(checked)) < len(checked):
+                raise SettingError(
+                    f"{spelt('spread', given)} of a coordinate twice", _EXPECTED, _EXAMPLE
+                )
+            return cls(dict(checked))
         if not isinstance(given, str):
             raise SettingError(spelt("spread", given), _EXPECTED, _EXAMPLE)
         if (
@@ -115,16 +120,21 @@ def _columns(name: str, layout: Layout | None) -> tuple[int, ...]:
         ) from None
 
 
+def _coordinate(text: str) -> int | str:
+    """Return a number, or the name of a part."""
+    if not text:
+        raise ValueError("a deviation of nothing")
+    try:
+        return int(text)
+    except ValueError:
+        return text
+
+
 def _read(text: str) -> dict[int | str, float]:
     """Read "3:0.5,goal:0.1"."""
     try:
         pairs = [part.rpartition(":")[::2] for part in text.split(",")]
-        read = {
-            int(one) if one.isdigit() else one.strip(): float(deviation)
-            for one, deviation in pairs
-        }
-        if "" in read:
-            raise ValueError("a deviation of nothing")
+        read = {_coordinate(one.strip()): float(deviation) for one, deviation in pairs}
         if len(read) < len(pairs):
             raise ValueError("a coordinate twice")
         return read

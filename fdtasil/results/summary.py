@@ -45,24 +45,25 @@ def run_rows(report: Mapping[str, Any]) -> Rows:
 def call_of(settings: Mapping[str, Any], history: int) -> str:
     """Return the call of a run, as far as its settings say it.
 
-    What an expert, an environment or a dataset is made with, and functions, stand in no file:
-    they are named, and left to the reader.
+    Functions, datasets, and environments that gymnasium does not know stand in no file: they are
+    named, and left to the reader; so is what an environment is made with.
 
     Args:
         settings: Of the run's configuration.
         history: How many observations the student sees.
     """
-    given, lost = [], []
-    for name, found in (
-        ("expert", settings.get("expert_sha256") or _is_address(settings["expert"])),
-        ("env", _is_registered(settings["env"])),
-    ):
-        said = settings[name]
-        given.append(repr(said) if found or said is None else name)
-        lost += [] if given[-1] != name else [f"{name} = ...  # {in_one_line(str(said))}\n"]
+    of_data, lost = settings.get("dataset"), []
+    is_file = settings.get("expert_sha256") or _is_address(settings["expert"])
+    given = [_named("expert", settings["expert"], is_file, lost)]
+    env = settings["env"] if settings.get("horizon") else None
+    given.append(_named("env", env, _is_registered(env), lost))
     probes = settings["probes"]
     given.append("0" if probes == "none" else repr(probes))
-    plain = {name: settings.get(name) for name in ("trainer", "episodes", "horizon", "seed")}
+    recorded = () if of_data else ("trainer", "episodes")
+    told = (*recorded, "horizon", "seed") if env else (*recorded, "seed")
+    plain = {name: settings.get(name) for name in told}
+    if of_data:
+        given.append(f"dataset={_named('dataset', f'sha256 {of_data}', False, lost)}")
     given += [f"{name}={value!r}" for name, value in plain.items() if value is not None]
     seen = settings.get("student_obs")
     if seen is not None:
@@ -85,6 +86,14 @@ def call_of(settings: Mapping[str, Any], history: int) -> str:
     inside = ",\n".join(f"    {one}" for one in given)
     made = "".join([*lost, "\n"]) if lost else ""
     return f"import fdtasil\n\n{made}result = fdtasil.distill(\n{inside},\n)\n"
+
+
+def _named(name: str, said: object, is_known: object, lost: list[str]) -> str:
+    """Return an argument as it is written; of what no file holds, its name, which is then lost."""
+    if said is None or is_known:
+        return repr(said)
+    lost.append(f"{name} = ...  # {in_one_line(str(said))}\n")
+    return name
 
 
 def _is_address(name: object) -> bool:

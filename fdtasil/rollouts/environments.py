@@ -128,12 +128,6 @@ class EnvironmentPool:
             if isinstance(given, str)
             else "call it on its own; an expert comes before the environment"
         )
-        if isinstance(given, str) and ":" in given and not wanted.kwargs:
-            module, _, name = given.partition(":")
-            self._advice = (
-                f"{module} must call gymnasium.register(id={name!r}, entry_point=...) when it is "
-                "imported; in Python, the class itself does as well"
-            )
         if wanted.kwargs:
             self._advice = f"check the names in kwargs ({', '.join(map(str, wanted.kwargs))})"
         self._make = wanted.factory()
@@ -234,10 +228,11 @@ class EnvironmentPool:
         except EnvironmentFault:
             raise
         except Exception as error:  # a factory is the caller's code and may raise anything
+            unknown = isinstance(error, gymnasium.error.UnregisteredEnv)
             raise EnvironmentFault(
                 f"the environment can't be made: {first_line(error)}",
                 "a gymnasium id, an environment, or a function without arguments that makes one",
-                self._advice,
+                f"{self._advice}{_REGISTER if unknown else ''}",
             ) from error
 
     def _checked(self, made: object) -> gymnasium.Env:
@@ -252,6 +247,9 @@ class EnvironmentPool:
     def _flat(self, made: gymnasium.Env) -> gymnasium.Env:  # pyright: ignore[reportRedeclaration]
         """Return a copy with flat spaces, and with what `wrap` puts around it."""
         return made if self.spaces.plain else Flat(made, self.spaces)
+
+
+_REGISTER = "; that module must call gymnasium.register(id=..., entry_point=...)"
 
 
 def resolve_horizon(horizon: int | None, pool: EnvironmentPool) -> int:

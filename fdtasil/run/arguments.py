@@ -298,12 +298,12 @@ def _source_anew(
     for a source and none is stored, "fresh" teaches best.
     """
     stored = given.probes if given is not None and given.answers is not None else None
+    asked = Probes.parse(spec)
+    if stored is not None:  # what is asked for is what is stored, or nothing
+        wanted = stored.resample and (spec is None or asked is not None)
+        return stored.with_order(order) if wanted else None
     if spec is not None:
-        asked = preset.complete(Probes.parse(spec))
-        anew = asked is not None and asked.resample and stored is not None
-        return _source_of(asked, preset, order, None, curved=curved) if anew else None
-    if stored is not None:
-        return stored.with_order(order) if stored.resample else None
+        return None
     return _source_of(FRESH, preset, order, None, curved=curved) if preset.calibrated else None
 
 

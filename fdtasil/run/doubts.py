@@ -50,15 +50,19 @@ def warn_of_falls(states: Demonstrations, expert: Episodes, keep: str) -> None:
         )
 
 
-def warn_of_idle_weights(given: Fit | None, source: Probes | None, *, calibrated: bool) -> None:
+def warn_of_idle_weights(
+    given: Fit, usual: Fit, source: Probes | None, *, calibrated: bool
+) -> None:
     """Warn of weights that somebody sets, and that nothing is multiplied by.
 
     Args:
-        given: The optimisation that the caller asks for, or None.
-        source: The derivative source; plain cloning has no use for any of them.
+        given: The optimisation.
+        usual: That of the preset; what is another there, somebody has set.
+        source: The derivative source. None, plain cloning, has no use for any weight, and is
+            compared with others that have.
         calibrated: Whether a calibration may still decide what is matched.
     """
-    if given is None or source is None:
+    if source is None:
         return
     weights, is_open = given.weights(source.match), source.match is None and calibrated
     used = {
@@ -68,7 +72,7 @@ def warn_of_idle_weights(given: Fit | None, source: Probes | None, *, calibrated
     matched = "answers as labels" if source.match == "labels" else "differences"
     for name, does in used.items():
         value = getattr(given, name)
-        if not does and value != getattr(Fit(), name):
+        if not does and value != getattr(usual, name):
             warn(f"{name}={value:g} weighs nothing: {source.describe()!r} matches {matched}")
 
 

@@ -64,7 +64,7 @@ def open_run_folder(
     else:
         check_free(path)
     before = _read_config(path) if resume else None
-    going_on = f'go on with the same call and resume="{path}" (--resume {path} alone)'
+    going_on = f'go on with resume="{path}" in the place of out=, else the same (--resume {path})'
     with locked(path):
         if before is not None:
             _check_same(before, config, path, finished=folder.finished)

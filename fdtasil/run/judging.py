@@ -1,5 +1,6 @@
 """A policy that is judged, opened for an environment."""
 
+import os
 from pathlib import Path
 
 from fdtasil.experts.expert import Expert, Hints
@@ -9,7 +10,7 @@ from fdtasil.experts.structure import in_spaces
 from fdtasil.results.distilled import Distilled
 from fdtasil.rollouts.environments import EnvironmentPool
 from fdtasil.rollouts.spaces import Spaces, flat_layout
-from fdtasil.student.view import StudentObservation
+from fdtasil.student.view import StudentObservation, Unseen
 
 __all__ = ["judged_in", "judged_through"]
 
@@ -26,13 +27,16 @@ def judged_through(
 
     Raises:
         StorageError: If the folder is a run's, and damaged.
+        SettingError: If it sees through a function that is lost.
     """
-    if isinstance(policy, str | Path) and (Path(policy) / "student.safetensors").is_file():
+    if isinstance(policy, str | Path) and os.path.isfile(Path(policy) / "student.safetensors"):
         policy = Distilled.load(policy)
     if isinstance(policy, Distilled):
         history = max(history, policy.steps_seen)
         if history == 1 and student_obs is None and not policy.view.is_whole:
             student_obs = policy.view.columns or policy.view.look
+            if isinstance(student_obs, Unseen):
+                raise student_obs.lost
         return policy.student, student_obs, history
     if history == 1 and student_obs is None:
         history = said_history(policy)

@@ -131,8 +131,9 @@ def distill(
         preset: Where defaults of probes and fit come from: "standard", or "paper" (TaSIL's
             settings: raw probes of radius 0.01, weight 0.01, 4,500 epochs).
         dataset: Train from this instead of recording: a run folder, its demonstrations.npz, or a
-            `Dataset`. Stored answers to probes are used as they are, but where they are those of
-            "fresh" and a cheap expert can be asked anew.
+            `Dataset`. Stored answers to probes are used as they are. Those of "fresh" and of
+            others that resample are asked anew where there is an expert that is cheap, or
+            where `probes` names them.
         evaluation_episodes: Episodes of the paired evaluation; 0 leaves it out.
         constraints: Name -> function of (N, n) observations and the (N, m) actions taken there,
             positive where the constraint is violated; the evaluation counts these steps.
@@ -206,7 +207,8 @@ def distill(
         run, bars = arguments.configure(subject, going_on), Progress(progress)
         run.check_spread()
         run.check_budget()
-        warn_of_idle_weights(fit, run.probes, calibrated=run.calibrated)
+        usual = arguments.preset.fit
+        warn_of_idle_weights(run.fit, usual, run.probes, calibrated=run.calibrated)
         with (
             open_run_folder(folder, config_of(run), resume=resume is not None) as kept,
             heard_interrupts() as interrupts,

@@ -122,7 +122,8 @@ def _read(command: Callable[..., None], name: str, rest: list[str]) -> Callable[
         with contextlib.redirect_stderr(said):
             return tyro.cli(whole, prog=f"fdtasil {name}", args=rest, config=())
     except SystemExit:
-        text = " ".join(re.sub("[\u2500-\u257f]", " ", said.getvalue()).split())
+        plain = re.sub(r"\x1b\[[0-9;]*m|[\u2500-\u257f]", " ", said.getvalue())
+        text = " ".join(plain.split())
         found = re.search(
             r"Error parsing (\S+): no type matching (.+) could be .* from \[(.+?)\]", text
         )

@@ -10,7 +10,7 @@ import numpy as np
 
 from fdtasil.checks import spelt
 from fdtasil.demonstrations.states import Demonstrations
-from fdtasil.errors import FdtasilError, SettingError, first_line
+from fdtasil.errors import SettingError, first_line
 from fdtasil.probes.answers import Answers
 from fdtasil.rollouts.behaviours import Policy
 
@@ -52,7 +52,12 @@ class Unseen:
         Raises:
             SettingError: Always.
         """
-        raise SettingError(
+        raise self.lost
+
+    @property
+    def lost(self) -> SettingError:
+        """What is said of it."""
+        return SettingError(
             f"the student sees through {self.name}, which no file can hold",
             "the function itself",
             "pass it: Distilled.load(folder, student_obs=...)",
@@ -213,8 +218,6 @@ def _from_function(given: Callable[[np.ndarray], np.ndarray], states: np.ndarray
     n, function = states.shape[1], _Copying(given)
     try:
         found, alone = np.asarray(function(states)), np.asarray(function(states[:1]))
-    except FdtasilError:  # of a function that was lost, which says so itself
-        raise
     except Exception as error:
         raise SettingError(
             f"student_obs raised {type(error).__name__} on {states.shape} observations: "
