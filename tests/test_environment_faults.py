@@ -191,7 +191,7 @@ def test_episodes_that_end_at_once_are_refused_before_training(ends, linear, not
 def test_an_environment_without_an_end_needs_a_horizon(linear):
     endless = "toy_environments:toy/Endless-v0"
     error = refused(endless, linear, SettingError, horizon=None)
-    assert error.found == "no horizon for toy/Endless-v0, which has no time limit of its own"
+    assert error.found == "no horizon for toy/Endless-v0, whose episodes no TimeLimit ends"
     assert fdtasil.distill(linear, endless, 1, **QUICK).report["states"] == 40
 
 
