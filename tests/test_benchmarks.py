@@ -65,6 +65,7 @@ def test_cells_side_by_side_have_one_thread_each(tmp_path):
         assert row["result"] == {"torch": 1, "others": 1}
 
 
+@pytest.mark.slow  # a cluster has to be begun
 def test_ray_gives_the_same_results(tmp_path):
     """Three cells on a Ray of this machine."""
     ray = pytest.importorskip("ray", reason="needs the extra: pip install 'fdtasil[ray]'")

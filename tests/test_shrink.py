@@ -65,6 +65,7 @@ def test_none_that_keeps_it(run):
     assert "no student" in str(found)
 
 
+@pytest.mark.slow
 def test_side_by_side_they_are_the_same(tmp_path):
     expert = str(mlp_onnx(tmp_path / "e.onnx"))
     run = fdtasil.distill(expert, TOY, 3, **QUICK)

@@ -986,6 +986,7 @@ print(fdtasil.Distilled.load("again").queries == result.queries, os.listdir("run
 
 
 @pytest.mark.fault(138)
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore")
 def test_it_runs_without_what_only_unix_has(tmp_path):
     shown = subprocess.run(

@@ -67,7 +67,10 @@ def test_episodes_are_those_of_single_environments(kind):
         assert np.array_equal(ours, theirs), name
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize(
+    "kind",
+    [pytest.param(kind, marks=[pytest.mark.slow] * kind.startswith("Subproc")) for kind in KINDS],
+)
 def test_a_whole_run(kind, tmp_path):
     """Rollout, probes, training, evaluation, ONNX, resume."""
     options = {**QUICK, "progress": False, "trainer": "dagger", "episodes": 3}
