@@ -228,6 +228,7 @@ def test_who_reads_may_stop_reading(words):
 
 
 @pytest.mark.fault(191)
+@pytest.mark.slow
 def test_few_descriptors_end_in_an_error_of_ours(tmp_path):
     """In a process that has loaded everything, and a fork of it for each number of them."""
     code = """

@@ -751,6 +751,7 @@ def _in_a_pool(seed):
 
 
 @pytest.mark.fault(134)
+@pytest.mark.slow
 def test_a_run_in_a_process_pool_is_not_lost():
     with ProcessPoolExecutor(1, get_context("spawn")) as pool:
         found = pool.submit(_in_a_pool, 3).result(120)
