@@ -215,14 +215,7 @@ class Expert:
         if raised.everywhere:
             raise raised.error
         self.count(len(rows) if len(rows) > 1 else 0, "check")
-        found: list[np.ndarray | None] = [None] if len(rows) == 1 else []
-        silent = 0  # in a row, up to here
-        for row in rows if len(rows) > 1 else ():
-            found.append(self._asked_alone(row[None], ask))
-            silent = silent + 1 if found[-1] is None else 0
-            # Seconds each, where it waits for a server or a solver that is gone.
-            if silent in _DOUBTED and self.silence.answered is not None:
-                self._check_control(ask, raised.error)
+        found = self._each_alone(rows, ask, raised.error) if len(rows) > 1 else [None]
         answered = [answer for answer in found if answer is not None]
         if len(answered) == len(rows):
             raise raised.error  # of the batch, not of a row
@@ -230,6 +223,20 @@ class Expert:
         size = self.action_size or (answered[0].shape[1] if answered else 1)
         none = np.full((1, size), np.nan, np.float32)
         return np.concatenate([none if answer is None else answer for answer in found])
+
+    def _each_alone(
+        self, rows: np.ndarray, ask: Policy, error: ExpertError
+    ) -> list[np.ndarray | None]:
+        """Ask row by row; raise the error where it does not even answer what it did before."""
+        found: list[np.ndarray | None] = []
+        silent = 0  # in a row, up to here
+        for row in rows:
+            found.append(self._asked_alone(row[None], ask))
+            silent = silent + 1 if found[-1] is None else 0
+            # Seconds each, where it waits for a server or a solver that is gone.
+            if silent in _DOUBTED and self.silence.answered is not None:
+                self._check_control(ask, error)
+        return found
 
     def _asked_alone(self, row: np.ndarray, ask: Policy) -> np.ndarray | None:
         try:

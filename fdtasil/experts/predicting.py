@@ -138,6 +138,13 @@ def _leaves(state: Any) -> list[np.ndarray]:
     return [np.asarray(part) for part in (state if isinstance(state, tuple | list) else (state,))]
 
 
+def _state_of(parts: list[np.ndarray], like: Any) -> Any:
+    """Return arrays as a state of the same kind, from which `_leaves` returns them."""
+    if isinstance(like, Mapping):
+        return dict(zip(sorted(like), parts, strict=True))
+    return tuple(parts) if isinstance(like, tuple | list) else parts[0]
+
+
 def _axis(two: np.ndarray, three: np.ndarray) -> int | None:
     """Return which axis of a part is that of rows, from parts for two rows and for three."""
     if two.ndim != three.ndim:
@@ -182,12 +189,7 @@ class _Carries:
             moved = memories[:, start:stop].reshape(rows, *shape).astype(part.dtype)
             parts.append(np.ascontiguousarray(np.moveaxis(moved, 0, axis)))
             start = stop
-        state: Any = parts[0]
-        if isinstance(self.like, Mapping):
-            state = dict(zip(sorted(self.like), parts, strict=True))
-        elif isinstance(self.like, tuple | list):
-            state = tuple(parts)
-        begun = np.zeros(rows, bool)
+        begun, state = np.zeros(rows, bool), _state_of(parts, self.like)
         actions, after = self.source.predict(
             observations, state=state, episode_start=begun, **self.options
         )

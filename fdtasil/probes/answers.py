@@ -65,6 +65,8 @@ class Answers:
 
     def among(self, rows: np.ndarray, states: int) -> "Answers":
         """Return answers around `states` states, those of (S,) rows as here, the others empty."""
+        if len(rows) == states:  # nothing is held out
+            return self
         numbers = np.zeros((states, *self.numbers.shape[1:]), self.numbers.dtype)
         values = np.zeros((states, *self.values.shape[1:]), self.values.dtype)
         numbers[rows], values[rows] = self.numbers, self.values

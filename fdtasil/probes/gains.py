@@ -162,8 +162,8 @@ def _law(
     steps = np.zeros_like(states, np.float64)
     steps[np.arange(_RAYS), axes] = units[axes]
     slopes = np.stack([_slope(expert, states, steps * rung) / rung for rung in _RUNGS])
-    moving = np.array([_moves(states, steps * rung).all() for rung in _RUNGS])
-    slopes, rungs = slopes[moving.argmax() :], _RUNGS[moving.argmax() :]
+    first = [_moves(states, steps * rung) for rung in _RUNGS].index(True)
+    slopes, rungs = slopes[first:], _RUNGS[first:]
     apart = np.nanmean(np.diff(slopes, axis=0) ** 2, axis=1)  # (rungs - 1, m)
     sizes = np.nanmean(slopes[1:] ** 2 + slopes[:-1] ** 2, axis=1)
     wide = rungs[1:]
@@ -201,16 +201,20 @@ def _jacobian(expert: Expert, rows: np.ndarray, steps: np.ndarray) -> np.ndarray
     return slopes.reshape(count, n, -1).transpose(0, 2, 1)
 
 
-def _moves(states: np.ndarray, steps: np.ndarray) -> np.ndarray:
-    """Return (R,) bool, whether float32 tells both ends of a difference from one another."""
-    ahead, behind = ((states + sign * steps).astype(np.float32) for sign in (1, -1))
-    return (ahead != behind).any(axis=1)
+def _ends(states: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return (R, n) float32 points, ahead of the states and behind them."""
+    return (states + steps).astype(np.float32), (states - steps).astype(np.float32)
+
+
+def _moves(states: np.ndarray, steps: np.ndarray) -> bool:
+    """Whether float32 tells both ends of every difference from one another."""
+    ahead, behind = _ends(states, steps)
+    return bool((ahead != behind).any(axis=1).all())
 
 
 def _slope(expert: Expert, states: np.ndarray, steps: np.ndarray) -> np.ndarray:
     """Return (R, m) changes for each whole step, over the distance that float32 really moves."""
-    ahead, behind = (states + sign * steps for sign in (1, -1))
-    ahead, behind = ahead.astype(np.float32), behind.astype(np.float32)
+    ahead, behind = _ends(states, steps)
     lengths = np.linalg.norm(ahead.astype(np.float64) - behind, axis=1)
     shares = lengths / np.linalg.norm(steps, axis=1)
     answers = expert.ask(np.concatenate([ahead, behind]), "probe").astype(np.float64)

@@ -9,6 +9,7 @@ import numpy as np
 from fdtasil.checks import check_count, check_number, spelt
 from fdtasil.errors import SettingError
 from fdtasil.probes.scales import ROUNDING
+from fdtasil.rollouts.naming import columns_named
 from fdtasil.rollouts.spaces import Layout
 
 __all__ = ["Spread", "SpreadLike", "stands_still"]
@@ -60,12 +61,11 @@ class Spread:
         if isinstance(given, str) and given != "bounds":
             given = _read(given)
         if isinstance(given, Mapping):
-            columns = [
-                (column, value)
+            checked = sorted(
+                _checked(column, value, n)
                 for key, value in given.items()
-                for column in (_columns(key, layout) if isinstance(key, str) else (key,))
-            ]
-            checked = sorted(_checked(column, value, n) for column, value in columns)
+                for column in _columns(key, layout)
+            )
             if len(dict(checked)) < len(checked):
                 raise SettingError(
                     f"{spelt('spread', given)} of a coordinate twice", _EXPECTED, _EXAMPLE
@@ -108,16 +108,10 @@ def _checked(coordinate: object, deviation: object, n: int) -> tuple[int, float]
         raise SettingError(f"spread: {error.found}", error.expected, _EXAMPLE) from None
 
 
-def _columns(name: str, layout: Layout | None) -> tuple[int, ...]:
-    try:
-        return layout.columns(name) if layout else {}[name]
-    except KeyError:
-        known = ", ".join(layout.names) if layout else ""
-        raise SettingError(
-            spelt("spread", {name: "..."}),
-            f"names of parts of the observation: {known or 'it has none'}",
-            "write these names, or numbers" if known else _EXAMPLE,
-        ) from None
+def _columns(key: object, layout: Layout | None) -> tuple[object, ...]:
+    if not isinstance(key, str):
+        return (key,)
+    return columns_named(key, layout, spelt("spread", {key: "..."}), _EXAMPLE)
 
 
 def _coordinate(text: str) -> int | str:

@@ -8,6 +8,8 @@ import gymnasium
 
 from fdtasil.errors import in_one_line, shown
 from fdtasil.experts.expert import rows_text
+from fdtasil.experts.http_expert import is_http_url
+from fdtasil.experts.hub import is_hub_uri
 from fdtasil.results.size import size_text
 from fdtasil.student.fit import Fit
 
@@ -52,18 +54,16 @@ def call_of(settings: Mapping[str, Any], history: int) -> str:
         settings: Of the run's configuration.
         history: How many observations the student sees.
     """
-    of_data, lost = settings.get("dataset"), []
-    is_file = settings.get("expert_sha256") or _is_address(settings["expert"])
-    given = [_named("expert", settings["expert"], is_file, lost)]
-    env = settings["env"] if settings.get("horizon") else None
-    given.append(_named("env", env, _is_registered(env), lost))
+    lost = _in_no_file(settings)
+    expert, env, data = settings["expert"], _environment(settings), settings.get("dataset")
+    given = ["expert" if "expert" in lost else repr(expert), "env" if "env" in lost else repr(env)]
     probes = settings["probes"]
     given.append("0" if probes == "none" else repr(probes))
-    recorded = () if of_data else ("trainer", "episodes")
+    recorded = () if data else ("trainer", "episodes")
     told = (*recorded, "horizon", "seed") if env else (*recorded, "seed")
     plain = {name: settings.get(name) for name in told}
-    if of_data:
-        given.append(f"dataset={_named('dataset', f'sha256 {of_data}', False, lost)}")
+    if data:
+        given.append("dataset=dataset")
     given += [f"{name}={value!r}" for name, value in plain.items() if value is not None]
     seen = settings.get("student_obs")
     if seen is not None:
@@ -84,20 +84,25 @@ def call_of(settings: Mapping[str, Any], history: int) -> str:
     told = ", ".join(f"{name}={fit[name]}" for name in names)
     given.append(f"fit=fdtasil.Fit({told})")
     inside = ",\n".join(f"    {one}" for one in given)
-    made = "".join([*lost, "\n"]) if lost else ""
-    return f"import fdtasil\n\n{made}result = fdtasil.distill(\n{inside},\n)\n"
+    made = [f"{name} = ...  # {in_one_line(said)}\n" for name, said in lost.items()]
+    first = "".join([*made, "\n"]) if made else ""
+    return f"import fdtasil\n\n{first}result = fdtasil.distill(\n{inside},\n)\n"
 
 
-def _named(name: str, said: object, is_known: object, lost: list[str]) -> str:
-    """Return an argument as it is written; of what no file holds, its name, which is then lost."""
-    if said is None or is_known:
-        return repr(said)
-    lost.append(f"{name} = ...  # {in_one_line(str(said))}\n")
-    return name
+def _environment(settings: Mapping[str, Any]) -> str | None:
+    return settings["env"] if settings.get("horizon") else None
 
 
-def _is_address(name: object) -> bool:
-    return isinstance(name, str) and name.startswith(("http://", "https://", "hf://"))
+def _in_no_file(settings: Mapping[str, Any]) -> dict[str, str]:
+    """Return the arguments that a reader has to make again, by name, with what they were."""
+    expert, env, data = settings["expert"], _environment(settings), settings.get("dataset")
+    is_address = is_http_url(expert) or is_hub_uri(expert)
+    found = {
+        "expert": None if settings.get("expert_sha256") or is_address else expert,
+        "env": None if _is_registered(env) else env,
+        "dataset": data and f"sha256 {data}",
+    }
+    return {name: said for name, said in found.items() if said is not None}
 
 
 def _is_registered(name: object) -> bool:

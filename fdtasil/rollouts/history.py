@@ -7,12 +7,20 @@ import numpy as np
 
 from fdtasil.rollouts.spaces import Layout
 
-__all__ = ["Window", "WithHistory", "past_size"]
+__all__ = ["Window", "WithHistory", "past_size", "present_size"]
 
 
 def past_size(history: int, observation_size: int, action_size: int) -> int:
     """Return how many numbers stand behind an observation: those of the steps before it."""
     return (history - 1) * (observation_size + action_size)
+
+
+def present_size(seen: int, history: int, action_size: int) -> tuple[int, int]:
+    """Return how many of the numbers seen are the present observation, and what is left over.
+
+    Of a whole history, n + past_size(history, n, m) numbers, nothing is.
+    """
+    return divmod(seen - (history - 1) * action_size, history)
 
 
 class Window:

@@ -191,9 +191,10 @@ class Configuration:
         Raises:
             SettingError: If there are some.
         """
-        columns, held = self.student_obs, self.held
-        hidden = set(held) if not isinstance(columns, tuple) else self._but(columns) | {*held}
-        if not self.spread.where_still and (lost := sorted(hidden & {*self.spread.deviations})):
+        columns = self.student_obs
+        seen = columns if isinstance(columns, tuple) else range(self.observation_size)
+        moved = set(seen) - set(self.held)
+        if not self.spread.where_still and (lost := sorted({*self.spread.deviations} - moved)):
             raise SettingError(
                 f"spread= of coordinate {lost[0]}, which no probe moves",
                 "coordinates that the student sees, no choices and nothing of the past",
@@ -206,9 +207,6 @@ class Configuration:
                 "probes in units of deviations, which are asked in this run",
                 "leave spread= out, or the dataset's answers (probes=0), or raw",
             )
-
-    def _but(self, columns: tuple[int, ...]) -> set[int]:
-        return set(range(self.observation_size)) - set(columns)
 
     def check_budget(self) -> None:
         """Refuse a run that may ask more than it is allowed to.

@@ -126,13 +126,18 @@ def warn_of_small_units(scales: Scales) -> None:
     small = scales.deviation < _SMALL * np.median(scales.deviation[scales.live])
     found = np.flatnonzero(looked_at & small & ~scales.told)
     if len(found):
-        told = ", ".join(f"{i}: {scales.deviation[i]:.2g}" for i in found[:_SHOWN])
-        more = f" and {len(found) - _SHOWN} more" if len(found) > _SHOWN else ""
+        told, more = _listed(found, scales.deviation)
         warn(
             f"{len(found)} coordinates deviate by less than a ten-thousandth of what others do "
             f"({told}{more}): that is taken for their units; of one that only stands nearly still "
             "here, spread={coordinate: deviation} says how far it will go"
         )
+
+
+def _listed(found: np.ndarray, deviations: np.ndarray) -> tuple[str, str]:
+    """Return some coordinates with their deviations, and how many more there are."""
+    told = ", ".join(f"{i}: {deviations[i]:.2g}" for i in found[:_SHOWN])
+    return told, f" and {len(found) - _SHOWN} more" if len(found) > _SHOWN else ""
 
 
 def warn_of_still_coordinates(lesson: Lesson, expert: Episodes) -> None:
@@ -151,8 +156,7 @@ def warn_of_still_coordinates(lesson: Lesson, expert: Episodes) -> None:
     if not len(found) or count > 2 * _FEW:
         return
     deviations = seen.std(axis=0, dtype=np.float64)
-    told = ", ".join(f"{i}: {deviations[i]:.2g}" for i in found[:_SHOWN])
-    more = f" and {len(found) - _SHOWN} more" if len(found) > _SHOWN else ""
+    told, more = _listed(found, deviations)
     warn(
         f"{len(found)} coordinates stand still within an episode and differ between episodes, "
         f"such as a command, a goal or a mass; {count} demonstrations show {count} values of "

@@ -3,6 +3,7 @@
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
+from itertools import chain
 
 from fdtasil.checks import spelt
 from fdtasil.demonstrations.dataset import Dataset
@@ -13,6 +14,7 @@ from fdtasil.experts.load import ExpertLike, expert_in, load_expert
 from fdtasil.experts.structure import in_spaces
 from fdtasil.rollouts.environments import EnvironmentLike, EnvironmentPool
 from fdtasil.rollouts.history import past_size
+from fdtasil.rollouts.naming import columns_named
 from fdtasil.rollouts.spaces import Layout, Spaces
 from fdtasil.student.view import StudentObservation, describe_view
 
@@ -138,18 +140,9 @@ def named(
     names = (student_obs,) if isinstance(student_obs, str) else student_obs
     if not isinstance(names, list | tuple) or not any(isinstance(one, str) for one in names):
         return student_obs
-    known = observations.names if observations else ()
-    columns: list[int] = []
-    for name in names:
-        try:
-            columns += observations.columns(str(name)) if observations else {}[name]
-        except KeyError:
-            raise SettingError(
-                spelt("student_obs", student_obs),
-                f"names of parts of the observation: {', '.join(known) or 'it has none'}",
-                "write these names, or indices" if known else "write indices, such as 0 1 2",
-            ) from None
-    return tuple(dict.fromkeys(columns))
+    said, example = spelt("student_obs", student_obs), "write indices, such as 0 1 2"
+    columns = (columns_named(str(name), observations, said, example) for name in names)
+    return tuple(dict.fromkeys(chain.from_iterable(columns)))
 
 
 def visible(

@@ -10,6 +10,7 @@ from fdtasil.checks import check_choice
 from fdtasil.errors import ExportError, SettingError
 from fdtasil.experts.onnx_expert import HISTORY
 from fdtasil.files.onnx.export import check_finite, export_module
+from fdtasil.rollouts.history import present_size
 from fdtasil.student import plain
 from fdtasil.student.c_int8 import INT8, rounded
 from fdtasil.student.c_source import c_header, c_source, check_parity
@@ -72,7 +73,7 @@ def _order(student: Student, metadata: Mapping[str, str]) -> str:
     """Return what stands where in an observation, "" where it is a plain vector."""
     if HISTORY in metadata:
         steps, m = int(metadata[HISTORY]), student.action_size
-        n = (student.observation_size - (steps - 1) * m) // steps
+        n, _ = present_size(student.observation_size, steps, m)
         return (
             f"0:{n} now, then for each of {steps - 1} steps before, the latest first, {n} of its "
             f"observation and {m} of its action; zeros before an episode began"

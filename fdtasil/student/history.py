@@ -4,7 +4,7 @@ import numpy as np
 
 from fdtasil.checks import check_count
 from fdtasil.errors import SettingError
-from fdtasil.rollouts.history import Window
+from fdtasil.rollouts.history import Window, present_size
 from fdtasil.student.policy import Student
 
 __all__ = ["History"]
@@ -34,8 +34,7 @@ class History:
 
     def __init__(self, student: Student, history: int) -> None:
         history, m = check_count("history", history), student.action_size
-        # n + (H - 1) (n + m) numbers are seen.
-        self.observation_size, rest = divmod(student.observation_size - (history - 1) * m, history)
+        self.observation_size, rest = present_size(student.observation_size, history, m)
         if rest or self.observation_size < 1:
             raise SettingError(
                 f"history={history} of a student that sees {student.observation_size} numbers",
