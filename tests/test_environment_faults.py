@@ -644,3 +644,10 @@ def test_starts_that_differ_with_one_seed_are_warned_of():
 def test_a_module_that_registers_nothing_is_told_how():
     with pytest.raises(EnvironmentFault, match=r"must call gymnasium\.register"):
         fdtasil.distill(run_forward, "toy_environments:Cart-v0", **QUICK)
+
+
+def test_an_unknown_id_is_not_blamed_on_its_kwargs():
+    wanted = fdtasil.Environment("Pendulam-v1", kwargs={"g": 1.6})
+    with pytest.raises(EnvironmentFault, match="ids of other packages") as caught:
+        fdtasil.distill(run_forward, wanted, **QUICK)
+    assert "kwargs" not in str(caught.value)

@@ -124,7 +124,7 @@ class EnvironmentPool:
         )
         self._single = False
         self._advice = (
-            "try gymnasium.make(...) on its own; ids of other packages are 'module:Id'"
+            _OF_AN_ID
             if isinstance(given, str)
             else "call it on its own; an expert comes before the environment"
         )
@@ -232,7 +232,7 @@ class EnvironmentPool:
             raise EnvironmentFault(
                 f"the environment can't be made: {first_line(error)}",
                 "a gymnasium id, an environment, or a function without arguments that makes one",
-                f"{self._advice}{_REGISTER if unknown else ''}",
+                f"{_OF_AN_ID}{_REGISTER}" if unknown else self._advice,
             ) from error
 
     def _checked(self, made: object) -> gymnasium.Env:
@@ -249,6 +249,7 @@ class EnvironmentPool:
         return made if self.spaces.plain else Flat(made, self.spaces)
 
 
+_OF_AN_ID = "try gymnasium.make(...) on its own; ids of other packages are 'module:Id'"
 _REGISTER = "; that module must call gymnasium.register(id=..., entry_point=...)"
 
 
