@@ -1,13 +1,20 @@
 """Activations of the student: exact GELU against what boards and verifiers have."""
 
 from collections.abc import Sequence
+from statistics import fmean
 from typing import Any
 
 from benchmarks.controllers import available
 from benchmarks.distillation import HORIZON, distillations
 from benchmarks.grid import SEEDS
 from benchmarks.runner import Cell, Row
-from benchmarks.statistics import difference_text, interval_text, paired_difference
+from benchmarks.statistics import (
+    DIFFERENCES_NOTE,
+    SCORES_NOTE,
+    difference_column,
+    interval_text,
+    paired_difference,
+)
 from benchmarks.tables import table
 
 __all__ = ["BENCHMARK"]
@@ -36,38 +43,35 @@ def arguments(cell: Cell) -> dict[str, Any]:
 
 
 def draw(rows: Sequence[Row]) -> dict[str, bytes]:
-    """One table: experts and widths down, activations across."""
-    lines = []
+    """A table a width: experts down, activations across, and what each costs beside GELU."""
+    text = f"{SCORES_NOTE}\n{DIFFERENCES_NOTE}\n"
+    text += "In the last line, a pair is an expert, and its score the mean over seeds.\n"
     for width in WIDTHS:
-        whole: dict[str, dict[tuple[str, int], float]] = {name: {} for name in ACTIVATIONS}
-        for row in rows:
-            cell = row["cell"]
-            if cell["width"] == width:
-                key = cell["expert"], cell["seed"]
-                whole[cell["activation"]][key] = row["result"]["normalized_return"]
-        shared = set.intersection(*(set(scores) for scores in whole.values()))
-        for expert in dict.fromkeys(expert for expert, _ in sorted(shared)):
-            mine = {
-                name: {key: value for key, value in scores.items() if key in shared}
-                for name, scores in whole.items()
-            }
-            found = [
-                [value for (one, _), value in scores.items() if one == expert]
-                for scores in mine.values()
-            ]
-            if len(found[0]) > 1:
-                lines.append([expert, str(width), *map(interval_text, found)])
-        if len(shared) > 1:
-            kept = {
-                name: {key: scores[key] for key in sorted(shared)}
-                for name, scores in whole.items()
-            }
-            texts = [
-                difference_text(*paired_difference(kept[name], kept["gelu"]), 3)
-                for name in ACTIVATIONS[1:]
-            ]
-            lines.append(["all, minus gelu", str(width), "", *texts])
-    return {"activations.md": table(["expert", "width", *ACTIVATIONS], lines).encode()}
+        found = _scores([row for row in rows if row["cell"]["width"] == width])
+        lines = [[expert, *map(interval_text, of.values())] for expert, of in found.items()]
+        if len(found) > 1:
+            means = [{e: fmean(of[name]) for e, of in found.items()} for name in ACTIVATIONS]
+            cells, _ = difference_column(
+                [paired_difference(one, means[0]) for one in means[1:]], 3
+            )
+            lines.append(["all, minus gelu", "", *cells])
+        text += f"\n## {width} x {width}\n\n{table(['expert', *ACTIVATIONS], lines)}"
+    return {"activations.md": text.encode()}
+
+
+def _scores(rows: Sequence[Row]) -> dict[str, dict[str, list[float]]]:
+    """Return expert -> activation -> the scores of those seeds that all of them have."""
+    found: dict[str, dict[str, dict[int, float]]] = {}
+    for row in sorted(rows, key=lambda row: (row["cell"]["expert"], row["cell"]["seed"])):
+        cell = row["cell"]
+        of = found.setdefault(cell["expert"], {name: {} for name in ACTIVATIONS})
+        of[cell["activation"]][cell["seed"]] = row["result"]["normalized_return"]
+    seeds = {expert: set.intersection(*map(set, of.values())) for expert, of in found.items()}
+    return {
+        expert: {name: [one[seed] for seed in sorted(seeds[expert])] for name, one in of.items()}
+        for expert, of in found.items()
+        if len(seeds[expert]) > 1
+    }
 
 
 BENCHMARK = distillations("activations", __doc__ or "", cells, arguments, draw)

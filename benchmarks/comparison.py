@@ -2,9 +2,16 @@
 
 from collections.abc import Callable, Mapping, Sequence
 
+from benchmarks.grid import label
 from benchmarks.panels import SHARE, draw_panels
 from benchmarks.runner import Row
-from benchmarks.statistics import difference_text, interval_text, paired_difference
+from benchmarks.statistics import (
+    DIFFERENCES_NOTE,
+    SCORES_NOTE,
+    difference_column,
+    interval_text,
+    paired_difference,
+)
 from benchmarks.tables import table
 
 __all__ = [
@@ -23,6 +30,8 @@ Column = int | str
 Scores = Mapping[tuple[str, Column], Mapping[str, Mapping[int, float]]]
 """(expert, column) -> method -> seed -> score; of complete groups only."""
 TRAJECTORIES = "trajectories"
+# Of the distance between two columns, what their methods stand in: joined by lines, or not.
+_JOINED, _APART = 0.3, 0.8
 
 
 def scores_of(rows: Sequence[Row], methods: Sequence[str], seeds: int) -> Scores:
@@ -31,7 +40,7 @@ def scores_of(rows: Sequence[Row], methods: Sequence[str], seeds: int) -> Scores
     Args:
         rows: With `expert`, `method`, `seed` and `episodes` in their cells, `normalized_return`
             in their results.
-        methods: Which a group must have.
+        methods: Which a group must have; others that are complete stay in it.
         seeds: How many of each.
     """
     found: dict[tuple[str, Column], dict[str, dict[int, float]]] = {}
@@ -40,11 +49,11 @@ def scores_of(rows: Sequence[Row], methods: Sequence[str], seeds: int) -> Scores
         group = found.setdefault((cell["expert"], cell["episodes"]), {})
         of_method = group.setdefault(cell["method"], {})
         of_method[cell["seed"]] = row["result"]["normalized_return"]
-    return {
-        key: group
+    complete = {
+        key: {method: of for method, of in group.items() if len(of) >= seeds}
         for key, group in sorted(found.items(), key=lambda item: item[0])
-        if all(len(group.get(method, {})) >= seeds for method in methods)
     }
+    return {key: group for key, group in complete.items() if {*methods} <= group.keys()}
 
 
 def scores_table(scores: Scores, methods: Sequence[str], across: str = TRAJECTORIES) -> str:
@@ -53,7 +62,7 @@ def scores_table(scores: Scores, methods: Sequence[str], across: str = TRAJECTOR
         [
             expert,
             str(column),
-            *(interval_text(list(group[method].values())) for method in methods),
+            *(interval_text(list(group[m].values())) if m in group else "-" for m in methods),
         ]
         for (expert, column), group in scores.items()
     )
@@ -64,10 +73,22 @@ def differences_table(
     scores: Scores, pairs: Sequence[tuple[str, str]], across: str = TRAJECTORIES
 ) -> str:
     """Return a table of mean differences on equal seeds, ours - theirs, with 95 % intervals."""
-    rows = []
-    for (expert, column), group in scores.items():
-        found = [paired_difference(group[ours], group[theirs]) for ours, theirs in pairs]
-        rows.append([expert, str(column), *(difference_text(*difference) for difference in found)])
+    columns = [
+        difference_column(
+            [
+                paired_difference(group[ours], group[theirs])
+                if {ours, theirs} <= group.keys()
+                else None
+                for group in scores.values()
+            ]
+        )
+        for ours, theirs in pairs
+    ]
+    rows = [
+        [expert, str(column), *(cells[line] for cells, _ in columns)]
+        for line, (expert, column) in enumerate(scores)
+    ]
+    rows.append(["intervals", "", *(counted for _, counted in columns)])
     return table(["expert", across, *(f"{ours} - {theirs}" for ours, theirs in pairs)], rows)
 
 
@@ -80,16 +101,28 @@ def scores_text(
     """Return the table of the methods, and that of the pairs' differences."""
     differences = differences_table(scores, pairs, across)
     table_of_scores = scores_table(scores, methods, across)
-    return f"{table_of_scores}\nDifferences on equal seeds:\n\n{differences}"
+    return f"{SCORES_NOTE}\n{table_of_scores}\n{DIFFERENCES_NOTE}\n{differences}"
 
 
 def draw_methods(
-    name: str, scores: Scores, methods: Sequence[str], pairs: Sequence[tuple[str, str]]
+    name: str,
+    scores: Scores,
+    methods: Sequence[str],
+    pairs: Sequence[tuple[str, str]],
+    pictured: Sequence[str] | None = None,
 ) -> dict[str, bytes]:
-    """Return picture and tables of methods that are called by their names; none without scores."""
+    """Return picture and tables of methods that are called by their names; none without scores.
+
+    Args:
+        name: Of the files.
+        scores: What is shown.
+        methods: In which order.
+        pairs: Whose differences are told.
+        pictured: Methods that the picture has; None for all.
+    """
     if not scores:
         return {}
-    picture = draw_scores(scores, methods, lambda method: method)
+    picture = draw_scores(scores, pictured or methods, label)
     return {
         f"{name}.png": picture,
         f"{name}.md": scores_text(scores, methods, pairs).encode(),
@@ -121,11 +154,12 @@ def draw_scores(
 
     def values(expert: str, number: int) -> dict[float, list[float]]:
         # Beside each other, so that equal methods can still be told apart.
-        shift = (number - (len(methods) - 1) / 2) * 0.8 / len(methods)
+        slot = (_JOINED if across else _APART) / len(methods)
+        shift = (number - (len(methods) - 1) / 2) * slot
         return {
             place + shift: list(scores[expert, column][methods[number]].values())
             for place, column in enumerate(columns)
-            if (expert, column) in scores
+            if methods[number] in scores.get((expert, column), {})
         }
 
     curves = {

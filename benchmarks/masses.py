@@ -5,12 +5,18 @@ from typing import Any
 
 import numpy as np
 
-import fdtasil
-from benchmarks.controllers import CONTROLLERS, available
+from benchmarks.controllers import available
+from benchmarks.distillation import recorded
 from benchmarks.grid import SEEDS
 from benchmarks.robustness import compare_under_disturbances
 from benchmarks.runner import Benchmark, Cell, Row
-from benchmarks.statistics import difference_text, interval_text, paired_difference
+from benchmarks.statistics import (
+    DIFFERENCES_NOTE,
+    SCORES_NOTE,
+    difference_column,
+    interval_text,
+    paired_difference,
+)
 from benchmarks.tables import table
 
 __all__ = ["BENCHMARK"]
@@ -48,25 +54,14 @@ def run(cell: Cell, device: str) -> dict[str, Any]:
 
 def _masses(expert: str) -> dict[int, float]:
     """Return the coordinates of the bodies' masses, and how far each will go."""
-    path, env = CONTROLLERS[expert].open()
-    recorded = fdtasil.distill(
-        path,
-        env,
-        0,
-        episodes=1,
-        horizon=2,
-        fit=fdtasil.Fit(steps=1),
-        evaluation_episodes=0,
-        progress=False,
-    )
-    first = recorded.demonstrations.observations[0]
+    first = recorded(expert, episodes=1, seed=0, horizon=2).demonstrations.observations[0]
     places = [_FIRST + _EACH * body + _MASS for body in range(_BODIES[expert])]
     return {place: SHARE * float(first[place]) for place in places if first[place] > 0}
 
 
 def draw(rows: Sequence[Row]) -> dict[str, bytes]:
     """One table: experts and masses down, methods across."""
-    lines = []
+    lines, gains = [], []
     for expert in dict.fromkeys(row["cell"]["expert"] for row in rows):
         for name in DISTURBED:
             shares = _shares(rows, expert, name)
@@ -74,10 +69,14 @@ def draw(rows: Sequence[Row]) -> dict[str, bytes]:
             if any(len(found) < 2 for found in shares.values()):
                 continue
             texts = [interval_text(list(found.values())) for found in shares.values()]
-            gain = difference_text(*paired_difference(shares[SPREAD], shares[FRESH]))
-            lines.append([expert, name, f"{np.mean(theirs):.2f}", *texts, gain])
+            gains.append(paired_difference(shares[SPREAD], shares[FRESH]))
+            lines.append([expert, name, f"{np.mean(theirs):.2f}", *texts])
+    cells, counted = difference_column(gains)
+    lines = [[*line, gain] for line, gain in zip(lines, cells, strict=True)]
+    lines.append(["intervals", "", "", "", "", "", counted])
     heads = ["expert", "physics", "the expert", *METHODS, f"{SPREAD} - {FRESH}"]
-    return {"masses.md": table(heads, lines).encode()}
+    text = f"{SCORES_NOTE}\n{DIFFERENCES_NOTE}\n{table(heads, lines)}"
+    return {"masses.md": text.encode()}
 
 
 def _shares(rows: Sequence[Row], expert: str, name: str) -> dict[str, dict[int, float]]:

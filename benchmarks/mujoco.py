@@ -13,6 +13,8 @@ __all__ = ["BENCHMARK"]
 
 BUDGETS = (5, 20)
 SOURCES: dict[str, int | str] = {"plain": 0, "probes": 10, "jacobian": "jacobian"}
+_LABELS = {"plain": "plain", "probes": "10 probes", "jacobian": "analytic Jacobian"}
+_NAMES = {"bc": "cloning", "dagger": "DAgger", "dart": "DART"}
 # What is the default is left out: other benchmarks' cells are then seen to be the same.
 TRAINERS: dict[str, dict[str, Any]] = {
     "bc": {},
@@ -52,7 +54,9 @@ def draw(rows: Sequence[Row]) -> dict[str, bytes]:
     if not scores:
         return {}
     pictures = {
-        f"mujoco_{budget}.png": draw_scores(_by_trainer(scores, budget), list(SOURCES), str, "")
+        f"mujoco_{budget}.png": draw_scores(
+            _by_trainer(scores, budget), list(SOURCES), _LABELS.__getitem__, ""
+        )
         for budget in dict.fromkeys(budget for _, budget in scores)
     }
     return {**pictures, "mujoco.md": scores_text(scores, list(METHODS), PAIRS).encode()}
@@ -61,7 +65,7 @@ def draw(rows: Sequence[Row]) -> dict[str, bytes]:
 def _by_trainer(scores: Scores, budget: Column) -> Scores:
     """Return the scores of one budget, trainers across and sources as methods."""
     return {
-        (expert, trainer): {source: found[f"{trainer}, {source}"] for source in SOURCES}
+        (expert, _NAMES[trainer]): {source: found[f"{trainer}, {source}"] for source in SOURCES}
         for (expert, column), found in scores.items()
         for trainer in TRAINERS
         if column == budget

@@ -17,17 +17,28 @@ Curves = Mapping[str, Mapping[float, Sequence[float]]]
 """What the legend calls a method -> place across the panel -> the scores of all seeds."""
 SHARE = "return, share of the expert's"
 
-# Told apart without colour: marker, line and grey.
-_STYLES = (
-    ("o", ":", "0.0"),
-    ("s", "-", "0.0"),
-    ("^", "--", "0.0"),
-    ("v", "--", "0.45"),
-    ("D", "-", "0.45"),
-    ("P", "-.", "0.0"),
+_ABREAST = 5  # panels in a row
+
+_Style = tuple[str, str, str]
+"""Marker, line and grey: told apart without colour."""
+# What several pictures show looks the same in all of them.
+_KNOWN: dict[str, _Style] = {
+    "plain": ("o", ":", "0.0"),
+    "plain cloning": ("o", ":", "0.0"),
+    "fresh": ("D", "-", "0.0"),
+    "fresh queries, longer training": ("D", "-", "0.0"),
+    "10 probes": ("^", "--", "0.0"),
+    "1 probe": ("v", "--", "0.45"),
+    "50 probes": ("P", "-.", "0.0"),
+    "analytic Jacobian": ("s", "-", "0.45"),
+}
+_OTHERS: tuple[_Style, ...] = (
     ("X", ":", "0.45"),
-    ("*", "-.", "0.45"),
-    ("h", "-", "0.7"),
+    ("*", "-.", "0.0"),
+    ("h", "-", "0.6"),
+    ("<", "--", "0.6"),
+    (">", ":", "0.0"),
+    ("d", "-.", "0.6"),
 )
 
 
@@ -52,12 +63,18 @@ def draw_panels(
     """
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(3.4 * len(experts), 3.6), layout="constrained")
-    panels = figure.subplots(1, len(experts), sharey=True, squeeze=False)[0]
-    for panel, (expert, curves) in zip(panels, experts.items(), strict=True):
+    across_page = min(_ABREAST, len(experts))
+    down = -(-len(experts) // across_page)
+    figure = Figure(figsize=(3.4 * across_page, 0.4 + 3.2 * down), layout="constrained")
+    grid = figure.subplots(down, across_page, sharey=True, squeeze=False)
+    panels = list(grid.flat)
+    for panel in panels[len(experts) :]:
+        panel.set_visible(False)
+    styles = _styles_of(list(next(iter(experts.values()))))
+    for panel, (expert, curves) in zip(panels, experts.items(), strict=False):
         panel.axhline(1, color="0.8", linewidth=0.8, zorder=0)
-        for number, (name, values) in enumerate(curves.items()):
-            _draw_curve(panel, values, number, name, joined=bool(across))
+        for name, values in curves.items():
+            _draw_curve(panel, values, styles[name], name, joined=bool(across))
         panel.set_title(expert, fontsize=10)
         if ticks is None:
             panel.set_xscale("log")
@@ -66,32 +83,46 @@ def draw_panels(
             panel.set_xlim(-0.6, len(ticks) - 0.4)
         panel.set_xlabel(across)
         panel.spines[["top", "right"]].set_visible(False)
-    panels[0].set_ylabel(score)
+    for panel in grid[:, 0]:
+        panel.set_ylabel(score)
     handles, labels = panels[0].get_legend_handles_labels()
     figure.legend(
-        handles, labels, loc="outside lower center", ncols=len(labels), fontsize=8, frameon=False
+        handles,
+        labels,
+        title="interquartile mean and 95 % bootstrap interval over seeds",
+        loc="outside lower center",
+        ncols=len(labels),
+        fontsize=8,
+        title_fontsize=8,
+        frameon=False,
     )
     return png_of(figure)
+
+
+def _styles_of(names: Sequence[str]) -> dict[str, _Style]:
+    """Return a style for each method, and no style twice."""
+    left = iter(_OTHERS)
+    return {name: _KNOWN.get(name) or next(left) for name in names}
 
 
 def _draw_curve(
     panel: "Axes",
     values: Mapping[float, Sequence[float]],
-    number: int,
+    style: _Style,
     name: str,
     *,
     joined: bool,
 ) -> None:
     means = np.array([interquartile_mean(sample) for sample in values.values()])
-    low, high = np.transpose([interval(sample) for sample in values.values()])
-    marker, line, grey = _STYLES[number]
+    low, high = np.reshape([interval(sample) for sample in values.values()], (-1, 2)).T
+    marker, line, grey = style
     panel.errorbar(
         list(values),
         means,
         yerr=np.maximum(0.0, [means - low, high - means]),
         marker=marker,
         markersize=4.5,
-        markerfacecolor="white" if number % 2 else grey,
+        markerfacecolor="white" if grey == "0.0" and line != ":" else grey,
         linestyle=line if joined else "none",
         linewidth=0.9,
         elinewidth=0.8,

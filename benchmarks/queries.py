@@ -9,7 +9,13 @@ from benchmarks.distillation import distillations, usual_arguments
 from benchmarks.grid import SEEDS, STANDARD_METHODS, experts, label
 from benchmarks.panels import draw_panels
 from benchmarks.runner import Cell, Row
-from benchmarks.statistics import difference_text, interval_text, paired_difference
+from benchmarks.statistics import (
+    DIFFERENCES_NOTE,
+    SCORES_NOTE,
+    difference_column,
+    interval_text,
+    paired_difference,
+)
 from benchmarks.tables import table
 
 __all__ = ["BENCHMARK"]
@@ -65,7 +71,8 @@ def draw(rows: Sequence[Row]) -> dict[str, bytes]:
     curves = _curves(rows)
     if not curves:
         return {}
-    text = f"{_scores(curves)}\nAgainst a baseline that asks no less:\n\n{_differences(curves)}"
+    text = f"{SCORES_NOTE}\n{_scores(curves)}\nAgainst a baseline that asks no less, and how many "
+    text += f"times as much it asks. {DIFFERENCES_NOTE}\n{_differences(curves)}"
     return {"queries.png": _picture(curves), "queries.md": text.encode()}
 
 
@@ -89,17 +96,22 @@ def _curves(rows: Sequence[Row]) -> dict[str, Curves]:
     }
 
 
-def _at_no_less(curves: Curves, ours: tuple[str, int], baseline: str) -> dict[int, float] | None:
-    """Return, by seed, what the baseline reaches with its least budget that asks no less.
+def _at_no_less(
+    curves: Curves, ours: tuple[str, int], baseline: str
+) -> tuple[dict[int, float], float] | None:
+    """Return what a baseline reaches by seed, and how much more it asks, of those who ask no less.
 
-    The baseline asks up to twice (DAgger four times) as much: no line has to be drawn between its
-    budgets, and what is won is won in spite of it. None where it asks less at its largest.
+    Its least budget of these.
+
+    No line has to be drawn between its budgets, and what is won is won in spite of what it asks
+    more. None where it asks less at its largest.
     """
     asked = _asked(curves[ours[0]][ours[1]])
     enough = [count for count in BUDGETS[baseline] if _asked(curves[baseline][count]) >= asked]
     if not enough:
         return None
-    return {seed: score for seed, (_, score) in curves[baseline][min(enough)].items()}
+    points = curves[baseline][min(enough)]
+    return {seed: score for seed, (_, score) in points.items()}, _asked(points) / asked
 
 
 def _asked(points: Mapping[int, tuple[int, float]]) -> float:
@@ -127,19 +139,29 @@ def _returns(points: Mapping[int, tuple[int, float]]) -> list[float]:
 
 def _differences(curves: Mapping[str, Curves]) -> str:
     """Return a table of paired differences, ours - a baseline's who asks no less."""
-    rows = []
-    for expert, of_expert in curves.items():
-        for method, count in _ours():
-            scores = {seed: score for seed, (_, score) in of_expert[method][count].items()}
-            ours = method, count
-            against = [_at_no_less(of_expert, ours, baseline) for baseline in BASELINES]
-            if not any(against):
-                continue
-            texts = [
-                difference_text(*paired_difference(scores, theirs)) if theirs else "asks less"
-                for theirs in against
-            ]
-            rows.append([*_head(expert, of_expert, method, count), *texts])
+    lines = [
+        (expert, of_expert, *ours)
+        for expert, of_expert in curves.items()
+        for ours in _ours()
+        if any(_at_no_less(of_expert, ours, baseline) for baseline in BASELINES)
+    ]
+    columns = []
+    for baseline in BASELINES:
+        theirs = [_at_no_less(of, (method, count), baseline) for _, of, method, count in lines]
+        cells, counted = difference_column(
+            [
+                one
+                and paired_difference(
+                    {seed: score for seed, (_, score) in of[method][count].items()}, one[0]
+                )
+                for one, (_, of, method, count) in zip(theirs, lines, strict=True)
+            ],
+            missing="asks less",
+        )
+        times = [f" ({one[1]:.1f} x)" if one else "" for one in theirs]
+        columns.append([*map("".join, zip(cells, times, strict=True)), counted])
+    heads = [_head(*line) for line in lines] + [["intervals", "", "", ""]]
+    rows = [[*head, *cells] for head, *cells in zip(heads, *columns, strict=True)]
     return table([*_HEADS, *(f"- {LABELS[baseline]}" for baseline in BASELINES)], rows)
 
 

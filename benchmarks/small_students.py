@@ -13,7 +13,14 @@ from benchmarks.distillation import HORIZON
 from benchmarks.grid import SEEDS
 from benchmarks.panels import draw_panels
 from benchmarks.runner import Benchmark, Cell, Row
-from benchmarks.statistics import difference_text, interval_text, paired_difference
+from benchmarks.statistics import (
+    DIFFERENCES_NOTE,
+    SCORES_NOTE,
+    Difference,
+    difference_column,
+    interval_text,
+    paired_difference,
+)
 from benchmarks.tables import table
 from fdtasil.results.size import c_microseconds, size_of_student
 
@@ -24,6 +31,11 @@ KEEP = 0.95
 WIDTHS = (16, 32, 64, 128, 256)
 _NAMES = {False: "fresh", True: "plain cloning"}  # by whether it is cloned
 _WAYS = ("c", "onnx")
+_CHOSEN = """\
+A student is the smallest whose interval over 20 episodes begins above the level. Its C code is
+judged from the same starts: that says that the code is the student, and on robots that are not
+chaotic nothing more of the choice.
+"""
 
 
 def cells(quick: bool) -> list[Cell]:
@@ -86,7 +98,13 @@ def draw(rows: Sequence[Row]) -> dict[str, bytes]:
     heads = ["expert", "smallest of each seed", "bytes at most", "its C code in the loop"]
     heads += ["microseconds as C, in onnxruntime", "smallest cloned"]
     heads += ["fresh 32 x 32 - cloned 256 x 256"]
-    small = table(heads, [_smallest(expert, results) for expert, results in found.items()])
+    cells, counted = difference_column([_headline(results) for results in found.values()])
+    lines = [
+        [*_smallest(expert, results), gain]
+        for (expert, results), gain in zip(found.items(), cells, strict=True)
+    ]
+    lines.append(["intervals", "", "", "", "", "", counted])
+    small = f"{SCORES_NOTE}\n{DIFFERENCES_NOTE}\n{_CHOSEN}\n{table(heads, lines)}"
     every = table(["expert", "", *(f"{w} x {w}" for w in WIDTHS)], _every(found))
     curves = {
         expert: {name: dict(enumerate(of.values())) for name, of in _curves(results).items()}
@@ -109,20 +127,21 @@ def _smallest(expert: str, results: Sequence[Any]) -> list[str]:
         expert,
         _widths(sizes),
         "-" if most is None else f"{most:,}",
-        interval_text([one["c_return"] for one in there]) if len(there) > 1 else "-",
+        f"{interval_text([one['c_return'] for one in there])}, {len(there)} seeds"
+        if there
+        else "-",
         ", ".join(f"{np.mean([one[f'{way}_microseconds'] for one in there]):.1f}" for way in _WAYS)
         if there
         else "-",
         _widths([_first(result, cloned=True) for result in results]),
-        _headline(results),
     ]
 
 
-def _headline(results: Sequence[Any]) -> str:
+def _headline(results: Sequence[Any]) -> Difference:
     """Return the mean difference of a small student with queries and a large cloned one."""
     curves = _curves(results)
     small, large = curves["fresh"][32], curves["plain cloning"][256]
-    return difference_text(*paired_difference(dict(enumerate(small)), dict(enumerate(large))))
+    return paired_difference(dict(enumerate(small)), dict(enumerate(large)))
 
 
 def _first(result: Any, *, cloned: bool) -> Any:

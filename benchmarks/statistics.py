@@ -1,12 +1,18 @@
 """Means that one bad seed does not rule, and how sure they are."""
 
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 from functools import partial
+from typing import Any
 
 import numpy as np
 from scipy import stats
 
 __all__ = [
+    "DIFFERENCES_NOTE",
+    "SCORES_NOTE",
+    "Difference",
+    "difference_column",
     "difference_text",
     "interquartile_mean",
     "interval",
@@ -15,11 +21,23 @@ __all__ = [
 ]
 
 _RESAMPLES = 2000
+_FEWEST = 5  # seeds that have an interval: of two normal ones it would cover 50 %, of three 75 %
+_CHANCE = 0.05
 _trimmed_mean = partial(stats.trim_mean, proportiontocut=0.25)
+
+SCORES_NOTE = f"""\
+Scores are interquartile means over seeds, with 95 % bootstrap intervals (of five normal seeds
+these cover 91 %); fewer than {_FEWEST} seeds are listed one by one.
+"""
+DIFFERENCES_NOTE = """\
+Differences are means on equal seeds, with 95 % intervals by Student's t. **Bold** is significant
+when its whole column is looked at together, too (Benjamini-Hochberg: of what is bold, one in
+twenty is expected to be chance).
+"""
 
 
 def interquartile_mean(values: Sequence[float]) -> float:
-    """Return the mean of the middle half of the values."""
+    """Return the mean of the middle half of the values: of five, of the middle three."""
     return float(_trimmed_mean(values))
 
 
@@ -28,7 +46,8 @@ def interval(
 ) -> tuple[float, float]:
     """Return the 95 % bootstrap interval of a statistic over seeds.
 
-    It is a little narrow: of five normal seeds' interquartile mean it covers 90 %.
+    It is a little narrow: of five normal seeds' interquartile mean it covers 91 %, of ten 94 %.
+    Where one seed in five falls far, of five 68 %.
 
     A single value, or equal ones, give an interval of no width: they say nothing of the spread.
 
@@ -53,26 +72,69 @@ def interval(
 
 
 def interval_text(values: Sequence[float], digits: int = 2) -> str:
-    """Return the interquartile mean and its interval, as tables show them."""
+    """Return the interquartile mean and its interval, or the values where they are few."""
     low, high = interval(values)
+    if len(values) < _FEWEST:
+        return ", ".join(f"{value:.{digits}f}" for value in values)
     return f"{interquartile_mean(values):.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
 
 
-def paired_difference(
-    ours: Mapping[int, float], theirs: Mapping[int, float]
-) -> tuple[float, tuple[float, float]]:
-    """Return the mean of ours - theirs over the seeds that both have, and its 95 % interval."""
-    seeds = sorted(ours.keys() & theirs.keys())
-    differences = np.array([ours[seed] - theirs[seed] for seed in seeds])
+@dataclass(frozen=True)
+class Difference:
+    """A mean difference over seeds.
+
+    Attributes:
+        mean: Of ours - theirs.
+        interval: 95 %, by Student's t.
+        chance: That it is as far from 0 if there is none (two-sided p-value).
+    """
+
+    mean: float
+    interval: tuple[float, float]
+    chance: float
+
+
+def paired_difference(ours: Mapping[Any, float], theirs: Mapping[Any, float]) -> Difference:
+    """Return the mean of ours - theirs over the pairs that both have.
+
+    Args:
+        ours: Seed, or what else makes a pair -> score. Pairs are independent of each other.
+        theirs: The same.
+    """
+    pairs = sorted(ours.keys() & theirs.keys())
+    differences = np.array([ours[pair] - theirs[pair] for pair in pairs])
     if len(differences) < 2:
-        raise ValueError(f"{len(differences)} seeds in common, a difference needs two")
-    error = differences.std(ddof=1) / len(differences) ** 0.5
-    reach = float(stats.t.ppf(0.975, len(differences) - 1) * error)
+        raise ValueError(f"{len(differences)} pairs, a difference needs two")
     mean = float(differences.mean())
-    return mean, (mean - reach, mean + reach)
+    if np.ptp(differences) == 0:
+        return Difference(mean, (mean, mean), 0.0 if mean else 1.0)
+    tested = stats.ttest_1samp(differences, 0.0)
+    low, high = tested.confidence_interval(1 - _CHANCE)
+    return Difference(mean, (float(low), float(high)), float(tested.pvalue))
 
 
-def difference_text(mean: float, interval: tuple[float, float], digits: int = 2) -> str:
+def difference_text(difference: Difference, digits: int = 2) -> str:
     """Return a difference and its interval, as tables show them."""
-    low, high = interval
-    return f"{mean:+.{digits}f} [{low:+.{digits}f}, {high:+.{digits}f}]"
+    low, high = difference.interval
+    return f"{difference.mean:+.{digits}f} [{low:+.{digits}f}, {high:+.{digits}f}]"
+
+
+def difference_column(
+    differences: Sequence[Difference | None], digits: int = 2, missing: str = "-"
+) -> tuple[list[str], str]:
+    """Return the cells of a table's column, and how many of its intervals exclude 0.
+
+    Args:
+        differences: None where there is none.
+        digits: Behind the point.
+        missing: What stands for None.
+    """
+    found = [one for one in differences if one is not None]
+    adjusted = stats.false_discovery_control([one.chance for one in found]) if found else []
+    sure = {id(one) for one, p in zip(found, adjusted, strict=True) if p <= _CHANCE}
+    cells = [missing if one is None else difference_text(one, digits) for one in differences]
+    for place, one in enumerate(differences):
+        if id(one) in sure:
+            cells[place] = f"**{cells[place]}**"
+    without = sum(one.chance <= _CHANCE for one in found)
+    return cells, f"{without} of {len(found)} exclude 0, {len(sure)} bold" if found else ""

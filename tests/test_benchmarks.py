@@ -15,7 +15,14 @@ pytest.importorskip("joblib", reason="needs the extra: pip install 'fdtasil[benc
 
 from benchmarks.__main__ import BENCHMARKS, main
 from benchmarks.runner import FIGURES, Benchmark, known_results, read_rows, results_of, run
-from benchmarks.statistics import interquartile_mean, interval, paired_difference
+from benchmarks.statistics import (
+    Difference,
+    difference_column,
+    interquartile_mean,
+    interval,
+    interval_text,
+    paired_difference,
+)
 
 ROOT = Path(__file__).parent.parent
 
@@ -109,10 +116,25 @@ def test_statistics_on_known_samples():
     low, high = interval(list(np.random.default_rng(0).normal(size=200)))
     assert -0.5 < low < 0 < high < 0.5
     assert interval([2.0]) == (2.0, 2.0)
-    mean, (low, high) = paired_difference({0: 1.0, 1: 2.0, 2: 9.0}, {0: 0.5, 1: 1.5})
-    assert mean == low == high == 0.5
+    same = paired_difference({0: 1.0, 1: 2.0, 2: 9.0}, {0: 0.5, 1: 1.5})
+    assert (same.mean, same.interval, same.chance) == (0.5, (0.5, 0.5), 0.0)
+    found = paired_difference({0: 1.0, 1: 2.0, 2: 3.0}, {0: 0.0, 1: 0.0, 2: 0.0})
+    reach = 4.303 / 3**0.5  # Student's t of two degrees of freedom
+    assert found.interval == pytest.approx((2 - reach, 2 + reach), abs=1e-3)
+    assert found.chance == pytest.approx(0.0742, abs=1e-4)
     with pytest.raises(ValueError, match="needs two"):
         paired_difference({0: 1.0}, {0: 1.0})
+    assert interval_text([0.5, 0.25]) == "0.50, 0.25"
+
+
+def test_a_column_marks_what_many_differences_together_leave():
+    """Of four at 0.04, or of ten, one is expected by chance; one of 0.001 is not."""
+    column = [Difference(0.1, (0.05, 0.15), chance) for chance in (0.001, 0.04, 0.04, 0.9)]
+    cells, counted = difference_column([*column, None])
+    plain = "+0.10 [+0.05, +0.15]"
+    assert cells == [f"**{plain}**", plain, plain, plain, "-"]
+    assert counted == "3 of 4 exclude 0, 1 bold"
+    assert difference_column([None]) == (["-"], "")
 
 
 def test_the_shell(tmp_path, capsys, monkeypatch):
@@ -153,14 +175,16 @@ def test_the_quality_table_pairs_equal_seeds(tmp_path):
                 "normalized_return": 0.9 if p else 0.5 + s / 10,
                 "survival": 1.0,
                 "expert_survival": 1.0,
-                "train_seconds": 7,
+                "steps": 4000,
             },
         }
         for p in (10, 0)
         for s in range(2)
     ]
     table = BENCHMARK.draw(json.loads(json.dumps(rows)))["quality.md"].decode()
-    assert "| e | 5 x 300 | 0.55" in table
+    assert "## 5 x 300 steps" in table
+    assert "10 probes 4,000" in table
+    assert "| e | 0.50, 0.60 | 0.90, 0.90 | - |" in table
     assert "+0.350" in table
 
 
@@ -281,7 +305,8 @@ def test_return_against_queries():
     expert = rows[0]["cell"]["expert"]
     # 600 to act, 1,008 to calibrate, 6,000 probes: cloning asks 12,000 with 40, 24,000 with 80.
     head = f"| {expert} | 10 probes | 2 | 7,608 |"
-    assert f"{head} +0.46 [+0.46, +0.46] | +0.42 [+0.42, +0.42] | +0.42 [+0.42, +0.42] |" in table
+    gains = ("**+0.46 [+0.46, +0.46]** (1.6 x)", *["**+0.42 [+0.42, +0.42]** (3.2 x)"] * 2)
+    assert f"{head} {' | '.join(gains)} |" in table
     assert f"{head} 0.50 [0.50, 0.50] |" in table
     assert table.count(f"| {expert} | 50 probes | 20 | 307,008 |") == 1  # none asks that much
     assert f"| {expert} | DAgger | 20 | 6,000 |" in table
@@ -319,7 +344,7 @@ def test_a_student_beside_its_expert_under_disturbances():
     name = rows[0]["cell"]["expert"]
     assert f"| {name} | none | 1.00 [1.00, 1.00] | 0.50 [0.50, 0.50] | 0.90 [0.90," in table
     assert f"| {name} | noise 0.1 | 0.50 [0.50, 0.50] | 0.25 [0.25, 0.25] | 0.45 [0.45," in table
-    assert "| +0.40 [+0.40, +0.40] |" in table
+    assert "| **+0.40 [+0.40, +0.40]** |" in table
     assert f"itself: {name} under mass x 1.2" in table
     rows[0]["result"]["noise 0.1"] = {**rows[0]["result"]["none"], "expert_return": 7.0}
     with pytest.raises(ValueError, match="the expert differs"):
@@ -387,8 +412,6 @@ def test_a_table_says_where_its_rows_were_made():
 
 
 def test_no_mean_is_taken_of_what_is_no_number():
-    from benchmarks.statistics import interval_text
-
     with pytest.raises(ValueError, match="no number"):
         interval_text([0.5, None, 0.7])
 
