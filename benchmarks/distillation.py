@@ -9,7 +9,15 @@ from benchmarks.controllers import CONTROLLERS
 from benchmarks.runner import Benchmark, Cell, Row
 from fdtasil.run.presets import preset_of
 
-__all__ = ["HORIZON", "STEPS", "call_of", "distil", "distillations", "usual_arguments"]
+__all__ = [
+    "HORIZON",
+    "STEPS",
+    "call_of",
+    "distil",
+    "distillations",
+    "recorded",
+    "usual_arguments",
+]
 
 HORIZON = 300
 STEPS = 4_000  # however much data there is; a method that has others says so
@@ -69,6 +77,20 @@ def call_of(settings: Mapping[str, Any]) -> dict[str, Any]:
     preset = preset_of(rest.get("preset", "standard"))
     student = fdtasil.Mlp(**of_student) if of_student else None
     return {**rest, "student": student, "fit": preset.fit_with(**of_fit)}
+
+
+def recorded(expert: str, *, episodes: int, seed: int, horizon: int = HORIZON) -> fdtasil.Dataset:
+    """Return the demonstrations that `distil` learns from with the same arguments."""
+    return fdtasil.distill(
+        *CONTROLLERS[expert].open(),
+        0,
+        episodes=episodes,
+        horizon=horizon,
+        seed=seed,
+        evaluation_episodes=0,
+        fit=fdtasil.Fit(steps=1),
+        progress=False,
+    ).dataset
 
 
 def distil(expert: str, **settings: Any) -> dict[str, Any]:

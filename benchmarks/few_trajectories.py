@@ -8,8 +8,7 @@ import numpy as np
 
 import fdtasil
 from benchmarks.comparison import draw_methods, scores_of
-from benchmarks.controllers import CONTROLLERS
-from benchmarks.distillation import HORIZON, call_of, distil
+from benchmarks.distillation import HORIZON, distil, recorded
 from benchmarks.grid import SEEDS, experts, side_by_side
 from benchmarks.runner import Benchmark, Cell, Row
 from fdtasil.probes.answers import Answers
@@ -20,11 +19,16 @@ __all__ = ["BENCHMARK", "with_neighbours"]
 BUDGETS = (1, 5)
 NEIGHBOURS = 10
 _APART = 10  # rows: a state's neighbours in time differ from it by next to nothing
+# Steps that fresh queries take by default, three times those of the others: is it the length?
+_LONGER = {"steps": 12_000}
 METHODS: dict[str, dict[str, Any]] = {
     "plain": {"probes": 0},
-    "neighbours": {},
+    "plain, longer": {"probes": 0, **_LONGER},
+    "neighbours": {"dataset": "neighbours"},
     "noise": {"probes": 0, "trainer": "noise"},
+    "noise, longer": {"probes": 0, "trainer": "noise", **_LONGER},
     "10 probes": {"probes": 10},
+    "10 probes, longer": {"probes": 10, **_LONGER},
     "10 probes, noise": {"probes": 10, "trainer": "noise"},
     "10 probes, both": {"probes": "10,both"},
     "fresh": {"probes": "fresh"},
@@ -32,9 +36,10 @@ METHODS: dict[str, dict[str, Any]] = {
     "fresh, noise": {"probes": "fresh", "trainer": "noise"},
 }
 PAIRS = (
+    ("fresh", "plain, longer"),
+    ("fresh", "noise, longer"),
+    ("fresh", "10 probes, longer"),
     ("fresh", "fresh, both"),
-    ("fresh", "10 probes"),
-    ("fresh", "noise"),
     ("fresh", "fresh, noise"),
     ("10 probes, both", "10 probes"),
     ("neighbours", "plain"),
@@ -46,21 +51,20 @@ def cells(quick: bool) -> list[Cell]:
     return side_by_side(quick, BUDGETS, experts(), METHODS)
 
 
-def measure(cell: Cell, device: str) -> dict[str, Any]:
-    """Distil with one method, default settings otherwise."""
+def arguments(cell: Cell) -> dict[str, Any]:
+    """Return the cell's method, default settings otherwise."""
     shape = {name: cell[name] for name in ("expert", "episodes", "seed")}
-    settings = {**shape, "horizon": HORIZON, "device": device, **METHODS[cell["method"]]}
-    if cell["method"] != "neighbours":
-        return distil(**settings)
-    recorded = _recorded(**settings)
-    rest = {name: settings[name] for name in ("expert", "seed", "horizon", "device")}
-    return distil(dataset=with_neighbours(recorded), **rest)
+    return {**shape, "horizon": HORIZON, **METHODS[cell["method"]]}
 
 
-def _recorded(expert: str, **settings: Any) -> fdtasil.Dataset:
-    path, environment = CONTROLLERS[expert].open()
-    call = call_of({**settings, "probes": 0, "evaluation_episodes": 0, "steps": 1})
-    return fdtasil.distill(path, environment, progress=False, **call).dataset
+def measure(cell: Cell, device: str) -> dict[str, Any]:
+    """Distil with one method; with neighbours, from demonstrations that are recorded first."""
+    settings = arguments(cell)
+    if "dataset" not in settings:
+        return distil(**settings, device=device)
+    shape = {name: settings[name] for name in ("expert", "seed", "horizon")}
+    dataset = with_neighbours(recorded(episodes=settings["episodes"], **shape))
+    return distil(dataset=dataset, **shape, device=device)
 
 
 def with_neighbours(dataset: fdtasil.Dataset) -> fdtasil.Dataset:
@@ -95,4 +99,4 @@ def draw(rows: Sequence[Row]) -> dict[str, bytes]:
     return draw_methods("few_trajectories", scores, list(METHODS), PAIRS)
 
 
-BENCHMARK = Benchmark("few_trajectories", __doc__ or "", cells, measure, draw)
+BENCHMARK = Benchmark("few_trajectories", __doc__ or "", cells, measure, draw, arguments=arguments)

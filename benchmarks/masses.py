@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-import fdtasil
-from benchmarks.controllers import CONTROLLERS, available
+from benchmarks.controllers import available
+from benchmarks.distillation import recorded
 from benchmarks.grid import SEEDS
 from benchmarks.robustness import compare_under_disturbances
 from benchmarks.runner import Benchmark, Cell, Row
@@ -48,18 +48,7 @@ def run(cell: Cell, device: str) -> dict[str, Any]:
 
 def _masses(expert: str) -> dict[int, float]:
     """Return the coordinates of the bodies' masses, and how far each will go."""
-    path, env = CONTROLLERS[expert].open()
-    recorded = fdtasil.distill(
-        path,
-        env,
-        0,
-        episodes=1,
-        horizon=2,
-        fit=fdtasil.Fit(steps=1),
-        evaluation_episodes=0,
-        progress=False,
-    )
-    first = recorded.demonstrations.observations[0]
+    first = recorded(expert, episodes=1, seed=0, horizon=2).demonstrations.observations[0]
     places = [_FIRST + _EACH * body + _MASS for body in range(_BODIES[expert])]
     return {place: SHARE * float(first[place]) for place in places if first[place] > 0}
 

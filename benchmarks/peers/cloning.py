@@ -9,7 +9,7 @@ import numpy as np
 
 import fdtasil
 from benchmarks.controllers import CONTROLLERS, available
-from benchmarks.distillation import HORIZON
+from benchmarks.distillation import HORIZON, recorded
 from benchmarks.peers.process import ask_peer
 from benchmarks.peers.weights import arrays_of, checked_policy, policy_of
 from benchmarks.runner import Cell, Row
@@ -131,8 +131,9 @@ def _theirs(cell: Cell) -> dict[str, Any]:
     rounds = settings["rounds"]
     if rounds:
         settings = settings | {"rounds": rounds | {"total": HORIZON * cell["episodes"]}}
-    recorded = _recorded(cell)
-    states, actions = recorded.demonstrations.observations, recorded.demonstrations.actions
+    shape = {name: cell[name] for name in ("expert", "episodes", "seed")}
+    dataset = recorded(**shape)
+    states, actions = dataset.demonstrations.observations, dataset.demonstrations.actions
     job = settings | {
         "seed": cell["seed"],
         "environment": environment,
@@ -145,7 +146,7 @@ def _theirs(cell: Cell) -> dict[str, Any]:
     result, found = ask_peer(PEER, job, given)
     seconds, steps = result["seconds"], result["environment_steps"]
 
-    low, high, last = recorded.low, recorded.high, len(seconds) - 1
+    low, high, last = dataset.low, dataset.high, len(seconds) - 1
     final = checked_policy(arrays_of(str(last), found), low, high, states, found["answers"])
     score = _return(final, cell)
     earlier = (
@@ -163,22 +164,6 @@ def _theirs(cell: Cell) -> dict[str, Any]:
         "seconds": seconds[-1],
         "seconds_to_enough": None if reached is None else seconds[reached],
     }
-
-
-def _recorded(cell: Cell) -> fdtasil.Dataset:
-    """Return the demonstrations that ours learns from."""
-    path, environment = CONTROLLERS[cell["expert"]].open()
-    return fdtasil.distill(
-        path,
-        environment,
-        0,
-        episodes=cell["episodes"],
-        horizon=HORIZON,
-        seed=cell["seed"],
-        fit=fdtasil.Fit(steps=1),
-        evaluation_episodes=0,
-        progress=False,
-    ).dataset
 
 
 def _return(policy: Any, cell: Cell) -> float:
