@@ -1,6 +1,7 @@
 """Do errors of derivatives tell a good student from a bad one: good, half-trained and cloned."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from statistics import mean, median
 from typing import Any
 
 from scipy.stats import spearmanr
@@ -45,9 +46,12 @@ def run(cell: Cell, device: str) -> dict[str, Any]:
         "normalized_return": result.evaluation.normalized_return,
         "derivatives": found.fidelity.error,
         "actions": found.fidelity.action_error,
-        "bound": found.bound,
+        "disturbed": found.disturbed,
+        "by_law": found.by_law,
+        "law": None if found.stability.law is None else vars(found.stability.law),
+        "largest_error": found.largest_error,
         "gap": found.gap,
-        "order": found.stability.order,
+        "ended": found.ended,
         "errors": None if found.errors is None else vars(found.errors),
         "conditions": [
             {"source": one.source, "asked": one.asked, "met": one.met} for one in found.conditions
@@ -56,53 +60,36 @@ def run(cell: Cell, device: str) -> dict[str, Any]:
 
 
 def draw(rows: Sequence[Row]) -> dict[str, bytes]:
-    """A line for each expert: return and errors of its students, how their ranks agree, bounds."""
+    """Returns and errors by expert and student, how their ranks agree, and what the laws say."""
     experts = list(dict.fromkeys(row["cell"]["expert"] for row in rows))
-    heads = ["expert", *(f"{name}: return, derivatives, actions" for name in STUDENTS)]
+    heads = ["expert", "runs", *(f"{name}: return, derivatives, actions" for name in STUDENTS)]
     heads += [f"rank correlation of return and {name}" for name in ERRORS]
-    heads += ["distance to the expert's path after 25 steps: bounded, measured"]
-    heads += ["derivative of the difference: measured, allowed by the corollary"]
-    lines = [_line(e, [row for row in rows if row["cell"]["expert"] == e]) for e in experts]
-    if len(experts) > 1:
-        lines.append(["all", *[""] * len(STUDENTS), *_agreements(rows), "", ""])
-    return {"fidelity.md": table(heads, lines).encode()}
+    lines = [_errors(e, [row for row in rows if row["cell"]["expert"] == e]) for e in experts]
+    lines.append(["all", str(len(rows)), *[""] * len(STUDENTS), *_agreements(rows)])
+    for name in STUDENTS:
+        mine = [row for row in rows if row["cell"]["student"] == name]
+        lines.append([f"all, {name}", str(len(mine)), *[""] * len(STUDENTS), *_agreements(mine)])
+    text = f"Means over seeds; errors are shares of the expert's own.\n\n{table(heads, lines)}\n"
+    text += "The good students, medians over seeds; distances are the largest within 25 steps of\n"
+    text += "ten episodes, in deviations.\n\n"
+    heads = ["expert", "seeds with a law", "it was measured up to", "largest error"]
+    heads += ["distance", "disturbances as large led to", "by the law"]
+    heads += ["derivative of the difference"]
+    heads += ["allowed by the corollary"]
+    good = [row for row in rows if row["cell"]["student"] == "good"]
+    lines = [
+        _laws(e, [row["result"] for row in good if row["cell"]["expert"] == e]) for e in experts
+    ]
+    return {"fidelity.md": (text + table(heads, [line for line in lines if line])).encode()}
 
 
-def _line(expert: str, rows: Sequence[Row]) -> list[str]:
-    cells = []
+def _errors(expert: str, rows: Sequence[Row]) -> list[str]:
+    line = []
     for student in STUDENTS:
         found = [row["result"] for row in rows if row["cell"]["student"] == student]
         names = ("normalized_return", *ERRORS) if found else ()
-        means = (sum(one[name] for one in found) / len(found) for name in names)
-        cells.append(", ".join(f"{mean:.2f}" for mean in means) or "-")
-    return [expert, *cells, *_agreements(rows), _distances(rows), _derivatives(rows)]
-
-
-def _distances(rows: Sequence[Row]) -> str:
-    """Return the bound and the measured distance of the good students, in deviations."""
-    good = [row["result"] for row in rows if row["cell"]["student"] == "good"]
-    bounds = [one["bound"] for one in good if one["bound"] is not None]
-    if not good:
-        return "-"
-    bound = f"{sum(bounds) / len(bounds):.3g}" if bounds else "no law"
-    return f"{bound}, {sum(one['gap'] for one in good) / len(good):.2g}"
-
-
-def _derivatives(rows: Sequence[Row]) -> str:
-    """Return |dDelta| of the good students, and what the corollary for r = 1 allows."""
-    found = [
-        (measured, allowed)
-        for row in rows
-        if row["cell"]["student"] == "good"
-        for one in row["result"].get("conditions", ())
-        if one["source"].startswith("corollary")
-        for name, measured, allowed in one["asked"]
-        if name == "|dDelta|"
-    ]
-    if not found:
-        return "-"
-    measured, allowed = (sum(values) / len(values) for values in zip(*found, strict=True))
-    return f"{measured:.3g}, {allowed:.2g}"
+        line.append(", ".join(f"{mean(one[name] for one in found):.2f}" for name in names) or "-")
+    return [expert, str(len(rows)), *line, *_agreements(rows)]
 
 
 def _agreements(rows: Sequence[Row]) -> list[str]:
@@ -114,6 +101,32 @@ def _agreements(rows: Sequence[Row]) -> list[str]:
         else "-"
         for name in ERRORS
     ]
+
+
+def _laws(expert: str, results: Sequence[Mapping[str, Any]]) -> list[str]:
+    """Return the line of an expert's good students; empty without one."""
+    if not results:
+        return []
+    lawful = [one for one in results if one["law"] is not None]
+    allowed = [
+        (here, most)
+        for one in lawful
+        for condition in one["conditions"]
+        if condition["source"].startswith("corollary")
+        for name, here, most in condition["asked"]
+        if name == "|dDelta|"
+    ]
+    values = (
+        [one["law"]["reach"][1] for one in lawful],
+        [one["largest_error"] for one in results],
+        [one["gap"] for one in results],
+        [one["disturbed"] for one in results if one["disturbed"] is not None],
+        [one["by_law"] for one in lawful],
+        [here for here, _ in allowed],
+        [most for _, most in allowed],
+    )
+    medians = (f"{median(found):.2g}" if found else "-" for found in values)
+    return [expert, f"{len(lawful)} of {len(results)}", *medians]
 
 
 BENCHMARK = Benchmark("fidelity", __doc__ or "", cells, run, draw)

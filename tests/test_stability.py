@@ -12,7 +12,11 @@ from benchmarks.stability import BENCHMARK, NUS, SOURCES, follow_student
 from benchmarks.stability_table import breaks_at
 from benchmarks.synthetic_system import SIZE, SyntheticSystem, advance, as_function, make_expert
 from fdtasil import load_expert
+from fdtasil.probes.scales import measure_scales
+from fdtasil.results.stability import stability_of
+from fdtasil.rollouts.behaviours import follow
 from fdtasil.rollouts.environments import EnvironmentPool
+from fdtasil.rollouts.rollout import rollout
 
 STARTS = np.random.default_rng(0).standard_normal((4, SIZE))
 
@@ -81,6 +85,21 @@ def test_a_constant_error_ends_where_gamma_says():
     assert found["on_expert"]["mean"]["median"] == pytest.approx(0.01, rel=1e-3)
     perfect = follow_student(zero, zero, STARTS)
     assert max(perfect["gap"]["q90"]) < 1e-12
+
+
+@pytest.mark.parametrize("nu", [0.5, 1.0, 2.0])
+def test_what_a_diagnosis_measures_of_it_is_the_formula(nu):
+    """A lasting error e leads 5 e^nu (1 - 0.95^T) away, in whichever direction."""
+    expert = load_expert(as_function(make_expert(0)), SIZE, SIZE)
+    with EnvironmentPool(lambda: SyntheticSystem(nu, 0)) as pool:
+        own = rollout(follow(expert.policy("act")), pool, range(5), 101)
+        scales = measure_scales(np.stack([-np.ones(SIZE), np.ones(SIZE)]))
+        found = stability_of(expert, own, pool, 101, np.ones(SIZE), scales, range(5))
+    law = found.law
+    assert law.exponent == pytest.approx(nu, rel=0.02)
+    reach = 5 * (1 - 0.95**100) / SIZE**0.5
+    assert law.constant == pytest.approx(reach, rel=0.1)
+    assert law.order == {0.5: 2, 1.0: 1, 2.0: 0}[nu]
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fdtasil.probes.scales import Scales
-from fdtasil.results.stability import Stability
+from fdtasil.results.stability import Law
 from fdtasil.rollouts.behaviours import Policy
 
 __all__ = ["Condition", "Errors", "conditions_of", "errors_of", "sphere_factor"]
@@ -36,29 +36,31 @@ class Errors:
         action: Largest |Delta|.
         derivative: Largest operator norm of the derivative of Delta, by central differences along
             every coordinate that is probed: these directions are independent.
-        difference: Estimate of that derivative's error: how far differences of twice the step are
-            from it, at most.
+        uncertainty: Estimate of that derivative's own error: how far differences of twice the
+            step are from it, at most.
         sphere: What a few fresh directions bound the same norm by, with probability 0.95 at all
-            of the states together, if L is no larger than `curvature` (TaSIL, appendix on finite
+            of the states together, if Delta bends no more than `bend` (TaSIL, appendix on finite
             differences, after Woolfe et al. 2008, theorem 3.15).
         lipschitz: Largest derivative of either policy: a lower bound of its Lipschitz constant.
         curvature: Largest second difference of either policy over the squared step, along
             coordinates and random directions: a lower bound of the Lipschitz constant of its
             derivative, which a network of ReLUs does not have.
+        bend: The same of Delta itself; at most twice `curvature`.
         states: At how many states.
     """
 
     action: float
     derivative: float
-    difference: float
+    uncertainty: float
     sphere: float
     lipschitz: float
     curvature: float
+    bend: float
     states: int
 
     def __str__(self) -> str:
         return (
-            f"|Delta| {self.action:.2g}, |dDelta| {self.derivative:.2g} +- {self.difference:.2g} "
+            f"|Delta| {self.action:.2g}, |dDelta| {self.derivative:.2g} +- {self.uncertainty:.2g} "
             f"({_DIRECTIONS} fresh directions bound it by {self.sphere:.2g}), "
             f"L {self.curvature:.2g}, at {self.states} states"
         )
@@ -72,7 +74,7 @@ class Condition:
         source: Of the statement.
         asked: What is compared, the measured value, and the largest that is allowed.
         promised: Bound on the largest distance of the student's path from the expert's, in
-            deviations, where the condition is met.
+            deviations, where the condition is met and the law holds.
     """
 
     source: str
@@ -86,7 +88,7 @@ class Condition:
 
     def __str__(self) -> str:
         said = (f"{name} is {here:.2g} (allowed {most:.2g})" for name, here, most in self.asked)
-        end = f"met, distance at most {self.promised:.2g}" if self.met else "not met"
+        end = f"met, and distance {self.promised:.2g} if the law holds" if self.met else "not met"
         return f"{self.source}: {', '.join(said)}; {end}"
 
 
@@ -160,7 +162,7 @@ def errors_of(
     if not heard.any():
         return None
     if not answered[heard].all():
-        return Errors(*[math.inf] * 6, states=int(heard.sum()))
+        return Errors(*[math.inf] * 7, states=int(heard.sum()))
     return around.at(heard).errors(int(scales.live.sum()))
 
 
@@ -205,17 +207,20 @@ class _Around:
             (sides[0] - sides[1]) * (d**0.5 / (2 * step))
             for sides, step in ((self.near, _NEAR), (self.wide, 2 * _NEAR))
         )
-        bends = (_most(sides.sum(axis=0) - 2 * self.here) for sides in (self.bent, self.away))
-        curvature = d * max(bends) / _BENT**2
+        bends = [sides.sum(axis=0) - 2 * self.here for sides in (self.bent, self.away)]
+        curvature, bend = (
+            d * max(map(_most, found)) / _BENT**2 for found in (bends, map(_apart, bends))
+        )
         along = d**0.5 * _most(_apart(self.away[0] - self.away[1])) / (2 * _BENT)
         factor = sphere_factor(self.near.shape[1], _DIRECTIONS, states=len(self.here))
         return Errors(
             action=_most(_apart(self.here)),
             derivative=_norm(_apart(first)),
-            difference=_norm(_apart(second - first)),
-            sphere=factor * (along + _BENT / d**0.5 * curvature),
+            uncertainty=_norm(_apart(second - first)),
+            sphere=factor * (along + _BENT / d**0.5 * bend / 2),
             lipschitz=max(_norm(first[..., 0, :]), _norm(first[..., 1, :])),
             curvature=curvature,
+            bend=bend,
             states=len(self.here),
         )
 
@@ -250,33 +255,30 @@ def _norm(derivatives: np.ndarray) -> float:
     return float(np.linalg.norm(np.moveaxis(derivatives, 0, 2), ord=2, axis=(1, 2)).max())
 
 
-def conditions_of(errors: Errors, stability: Stability) -> tuple[Condition, ...]:
-    """Return those of TaSIL's statements that are about such a loop; none where no law was found.
+def conditions_of(errors: Errors, law: Law) -> tuple[Condition, ...]:
+    """Return those of TaSIL's statements that are about such a loop.
 
     The derivative's error is taken with the error of its differences added, which is what the
     appendix's alpha-hat and eta-hat are for. The constants are estimates and lower bounds, from a
-    few states: a condition that is met here need not be met everywhere.
+    few states and disturbances: a condition that is met here need not be met everywhere, and what
+    it then promises holds if the law does.
 
     Args:
         errors: Of the student on the expert's path.
-        stability: Of the expert's loop: gamma(e) = C e^nu, within the reach of its measurement.
+        law: Of the expert's loop: gamma(e) = C e^nu, within the reach of its measurement.
     """
-    constant, exponent, reach = stability.constant, stability.exponent, stability.reach
-    if constant is None or exponent is None or reach is None:
-        return ()
-    law = _Law(constant, exponent, *reach, errors)
-    found = []
-    if exponent > 1 + _NEARLY:
-        found.append(law.order_zero())
-    if exponent > 0.5:
-        found.append(law.order_one())
-    if abs(exponent - 1) <= _NEARLY:
-        found += [law.equal_orders(), law.corollary()]
-    return (*found, law.solved())
+    of, found = _Statements(law.constant, law.exponent, *law.reach, errors), []
+    if law.exponent > 1 + _NEARLY:
+        found.append(of.order_zero())
+    if law.exponent > 0.5:
+        found.append(of.order_one())
+    if abs(law.exponent - 1) <= _NEARLY:
+        found += [of.equal_orders(), of.corollary()]
+    return (*found, of.solved())
 
 
 @dataclass(frozen=True)
-class _Law:
+class _Statements:
     """The statements for one law and one student. Names are the paper's."""
 
     constant: float
@@ -287,7 +289,7 @@ class _Law:
 
     @property
     def _derivative(self) -> float:
-        return self.errors.derivative + self.errors.difference
+        return self.errors.derivative + self.errors.uncertainty
 
     @property
     def _linear(self) -> float:
@@ -353,7 +355,7 @@ class _Law:
         """Proposition 3.1 itself, with Delta bounded by its Taylor polynomial and a remainder."""
         forgiven = np.minimum((_STARTS / self.constant) ** (1 / self.nu), self.eta)
         error = self.errors.action + self._derivative * _STARTS
-        error += self.errors.curvature * _STARTS**2
+        error += self.errors.bend / 2 * _STARTS**2
         enough = np.flatnonzero(error <= forgiven)
         place = enough[0] if enough.size else int(np.argmin(error / forgiven))
         distance = float(_STARTS[place])

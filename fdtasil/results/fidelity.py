@@ -1,11 +1,10 @@
-"""How well a student's derivatives are its expert's, beside what the expert's own noise allows."""
+"""How well a student's derivatives are its expert's, beside how rough the expert is itself."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from fdtasil.experts.expert import Expert
 from fdtasil.probes.scales import Scales
 from fdtasil.rollouts.behaviours import Policy, has_none
 
@@ -17,24 +16,33 @@ USUAL = 0.3
 GOOD = "students at their expert's return have 20 to 60 %, plain copies that fail 95 to 110 %"
 """What that number was on eight experts (benchmarks/figures/fidelity.md)."""
 _DIRECTIONS = 8
+_STILL = 1e-6  # of half its range: an action that varies less does not
+_ROUNDING = 1e-5  # of how actions vary: an expert that changes less does not react
 
 
 @dataclass(frozen=True)
 class Fidelity:
     """Errors of a student's differences along held-out directions, around its expert's states.
 
+    Actions are taken as the environment takes them, each in units of how the expert's varies.
+
     Attributes:
         radii: In standard deviations of each coordinate.
         errors: At each radius the root mean square error of a difference of the student, as a
-            share of the expert's own difference. 0 is the expert, 1 a student that does not react.
-        floors: What the expert's own noise makes of that at least.
+            share of the expert's own difference. 0 is the expert, 1 a student that does not
+            react. NaN where the expert does not react, or has no answers; infinite where the
+            student has none.
+        roughness: What the expert's roughness at 1e-4 deviations (noise, rounding, jumps) is, as
+            the same share: of an expert that is random, no error is below it.
         action_error: Of the actions at the states, as a share of how the expert's vary.
+        answered: Share of the moved states at which the expert has an answer.
     """
 
     radii: tuple[float, ...]
     errors: tuple[float, ...]
-    floors: tuple[float, ...]
+    roughness: tuple[float, ...]
     action_error: float
+    answered: float = 1.0
 
     @property
     def error(self) -> float:
@@ -44,8 +52,9 @@ class Fidelity:
 
 def fidelity_of(
     student: Policy,
-    expert: Expert,
+    expert: Policy,
     states: np.ndarray,
+    units: np.ndarray,
     scales: Scales,
     random: np.random.Generator,
     held: Sequence[int] = (),
@@ -53,45 +62,81 @@ def fidelity_of(
     """Compare differences of a student and its expert (TaSIL, appendix on finite differences).
 
     Args:
-        student: (B, n) -> (B, m).
-        expert: Counts its rows under "check".
-        states: (S, n) of the expert's own episodes.
+        student: (B, n) -> (B, m) actions as the environment takes them.
+        expert: The same; rows of NaN are no answer.
+        states: (S, n) of the expert's own episodes; it has an answer at some.
+        units: (m,) of actions, half their range.
         scales: Of its states.
         random: Draws directions that nothing was trained on.
-        held: Coordinates that nothing moves: choices, flags, whole numbers.
+        held: Coordinates that nothing moves: choices, flags, whole numbers. Not all of them.
     """
     live = scales.probed("whitened") & ~np.isin(np.arange(states.shape[1]), list(held))
     count, n = states.shape
     normal = random.standard_normal((count, _DIRECTIONS, n)) * live
     unit = normal / np.linalg.norm(normal, axis=2, keepdims=True) * live.sum() ** 0.5
     steps = unit * np.where(live, scales.deviation, 0.0)
-    theirs, ours = expert.ask(states, "check"), student(states)
-    errors, floors = [], []
-    noise = _noise(expert, states, theirs, steps[:, 0])
-    for radius in RADII:
-        points = (states[:, None] + radius * steps).astype(np.float32).reshape(-1, n)
-        said = expert.ask(points, "check").reshape(count, _DIRECTIONS, -1)
-        mine = student(points).reshape(count, _DIRECTIONS, -1)
-        heard = ~has_none(said.reshape(len(points), -1)).reshape(count, _DIRECTIONS)
-        difference = (said - theirs[:, None])[heard]
-        error = (mine - ours[:, None])[heard] - difference
-        size = float(np.sqrt(np.nanmean(difference**2)))
-        apart = float(np.sqrt(np.nanmean(error**2)))
-        errors.append(_share(apart, size))
-        floors.append(_share(2**0.5 * noise, size))
-    spread = float(np.sqrt(np.nanmean((theirs - np.nanmean(theirs, axis=0)) ** 2)))
-    apart = float(np.sqrt(np.nanmean((ours - theirs) ** 2)))
-    return Fidelity(RADII, tuple(errors), tuple(floors), _share(apart, spread))
+    answers = expert(states)
+    heard = ~has_none(answers)
+    states, steps, theirs = states[heard], steps[heard], answers[heard].astype(np.float64)
+    ours, varies = student(states).astype(np.float64), theirs.std(axis=0)
+    varies = np.where(varies > _STILL * units, varies, units)
+    pair = _Pair(student, expert, varies)
+    noise = pair.noise(states, theirs, steps[:, 0])
+    found = [pair.compared(states, theirs, ours, radius * steps) for radius in RADII]
+    apart = _size((ours - theirs) / varies)
+    spread = _size((theirs - theirs.mean(axis=0)) / varies)
+    return Fidelity(
+        RADII,
+        tuple(_share(error, size) for error, size, _ in found),
+        tuple(_share(2**0.5 * noise, size) for _, size, _ in found),
+        _share(apart, spread),
+        float(np.mean([heard for *_, heard in found])),
+    )
+
+
+@dataclass(frozen=True)
+class _Pair:
+    """A student and its expert, and the units of their actions."""
+
+    student: Policy
+    expert: Policy
+    units: np.ndarray
+
+    def compared(
+        self, states: np.ndarray, theirs: np.ndarray, ours: np.ndarray, steps: np.ndarray
+    ) -> tuple[float, float, float]:
+        """Return the size of the differences' error, that of the expert's, the share it answers.
+
+        Args:
+            states: (S, n).
+            theirs: (S, m) the expert's actions there.
+            ours: (S, m) the student's.
+            steps: (S, P, n) from them.
+        """
+        shape = steps.shape[:2]
+        points = (states[:, None] + steps).astype(np.float32).reshape(-1, states.shape[1])
+        said, mine = (ask(points).astype(np.float64) for ask in (self.expert, self.student))
+        heard = ~has_none(said).reshape(shape)
+        size = (said.reshape(*shape, -1) - theirs[:, None])[heard] / self.units
+        error = (mine.reshape(*shape, -1) - ours[:, None])[heard] / self.units - size
+        return _size(error), _size(size), float(heard.mean())
+
+    def noise(self, states: np.ndarray, theirs: np.ndarray, steps: np.ndarray) -> float:
+        """Return the root mean square error of an action, by second differences very near."""
+        near = 1e-4 * steps
+        sides = [self.expert((states + sign * near).astype(np.float32)) for sign in (1, -1)]
+        second = (sides[0].astype(np.float64) + sides[1] - 2 * theirs) / self.units
+        return _size(second[~has_none(second)]) / 6**0.5
+
+
+def _size(actions: np.ndarray) -> float:
+    """Return the root mean square; NaN of nothing, infinite where an action is missing."""
+    if not actions.size:
+        return float("nan")
+    size = float(np.sqrt((actions**2).mean()))
+    return float("inf") if np.isnan(size) else size
 
 
 def _share(part: float, whole: float) -> float:
-    """Return a part as a share; nothing of nothing is none."""
-    return part / whole if whole > 0 else 0.0 if part == 0 else float("inf")
-
-
-def _noise(expert: Expert, states: np.ndarray, theirs: np.ndarray, steps: np.ndarray) -> float:
-    """Return the root mean square error of an action, by second differences very near."""
-    near = 1e-4 * steps
-    sides = [expert.ask((states + sign * near).astype(np.float32), "check") for sign in (1, -1)]
-    second = sides[0].astype(np.float64) + sides[1] - 2 * theirs
-    return float(np.sqrt(np.nanmean(second**2) / 6))
+    """Return a part as a share; no number where the whole is rounding."""
+    return part / whole if whole > _ROUNDING else 0.0 if part == 0 else float("nan")

@@ -19,11 +19,12 @@ _POLICY = 1e-3  # of a policy's, which answers in float32
 
 @dataclass(frozen=True)
 class Linearisation:
-    """How fast the fastest small deviation grows in one step of the environment.
+    """The closed loop at single states of a path, each by itself.
 
-    A step changes a small deviation v of positions and speeds to M v. Where the largest
-    eigenvalue of M is below 1 in size, small deviations die out there. A coordinate that nothing
-    depends on, such as the place along a track, has the eigenvalue 1.
+    A step of the environment changes a small deviation v of positions and speeds to M v. At a
+    state where the loop stays, deviations die out if all eigenvalues of M are below 1 in size. A
+    path moves on, and what grows along it is not said by the eigenvalues of its steps. A
+    coordinate that nothing depends on, such as the place along a track, has the eigenvalue 1.
 
     Attributes:
         steps: Step of the expert's episode, one for each state.
@@ -64,12 +65,14 @@ def linearise(
 
     Returns:
         None where the environment is no MuJoCo environment of gymnasium, its observation is not
-        what the simulator's state says, or every episode ends before these steps.
+        what the simulator's state says, its actions are not the controls, or every episode ends
+        before these steps.
     """
     if pool.together is not None:
         return None
     (env,) = pool.take(1)
-    simulator, found = env.unwrapped, list[tuple[int, float, float]]()
+    simulator: Any = env.unwrapped
+    found: list[tuple[int, float, float]] = []
     if not _is_mujoco(simulator, pool.boxes.action_size):
         return None
     for seed in seeds:
@@ -80,7 +83,10 @@ def linearise(
             if step in steps:
                 size_of = partial(_largest, simulator, pool.bounds)
                 found.append((step, size_of(expert), size_of(student)))
-            seen, _, terminated, truncated, _ = env.step(_acted(expert, seen, pool.bounds))
+            action = _acted(expert, seen, pool.bounds)
+            seen, _, terminated, truncated, _ = env.step(action)
+            if not np.allclose(simulator.data.ctrl, action, atol=1e-6):
+                return None
             if terminated or truncated:
                 break
     if not found:
@@ -158,6 +164,7 @@ def _of_policy(simulator: Any, data: Any, bounds: OwnBounds, policy: Policy) -> 
         for along in sign * _POLICY * np.eye(size):
             simulator.data = _moved(model, data, along)
             mujoco.mj_forward(model, simulator.data)
+            mujoco.mj_rnePostConstraint(model, simulator.data)  # contact forces, as a step does
             rows.append(_observed(simulator))
     answers = bounds.put_inside(policy(np.stack(rows).astype(np.float32)))[0].astype(np.float64)
     return (answers[:size] - answers[size:]).T / (2 * _POLICY)

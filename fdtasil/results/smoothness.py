@@ -54,7 +54,9 @@ def _high_frequency(actions: np.ndarray, lengths: np.ndarray) -> float | None:
         if length < _LEAST:
             continue
         mine = episode[:length]
+        frequencies = np.fft.rfftfreq(length)
         power = np.abs(np.fft.rfft(mine - mine.mean(axis=0), axis=0)) ** 2
-        fast += float(power[np.fft.rfftfreq(length) > 0.25].sum())
+        power[(frequencies > 0) & (frequencies < 0.5)] *= 2  # each stands for its negative too
+        fast += float(power[frequencies > 0.25].sum())
         total += float(power.sum())
     return fast / total if total > 0 else None
