@@ -9,7 +9,7 @@ import fdtasil
 from benchmarks.controllers import OWN
 from benchmarks.grid import SEEDS
 from benchmarks.runner import Benchmark, Cell, Row
-from benchmarks.statistics import interval_text
+from benchmarks.statistics import SCORES_NOTE, interval_text
 from benchmarks.tables import table
 
 __all__ = ["BENCHMARK"]
@@ -92,7 +92,7 @@ def draw(rows: Sequence[Row]) -> dict[str, bytes]:
                     lines.append([expert, answers, str(episodes), *map(_text, found.values())])
     heads = ["expert", "what it answers", "episodes"]
     heads += [f"{name}: return, agreement" for name in PROBES]
-    return {"choices.md": table(heads, lines).encode()}
+    return {"choices.md": f"{SCORES_NOTE}\n{table(heads, lines)}".encode()}
 
 
 def _found(rows: Sequence[Row], shape: Cell) -> list[dict[str, Any]]:

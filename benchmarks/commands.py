@@ -3,11 +3,10 @@
 from collections.abc import Sequence
 from typing import Any
 
+from benchmarks.comparison import by_demonstrations
 from benchmarks.distillation import distillations
 from benchmarks.grid import SEEDS
 from benchmarks.runner import Cell, Row
-from benchmarks.statistics import interval_text
-from benchmarks.tables import table
 
 __all__ = ["BENCHMARK"]
 
@@ -40,19 +39,8 @@ def arguments(cell: Cell) -> dict[str, Any]:
 
 def draw(rows: Sequence[Row]) -> dict[str, bytes]:
     """One table: demonstrations down, methods across."""
-    lines = []
-    for episodes in EPISODES:
-        found = {
-            method: [
-                row["result"]["normalized_return"]
-                for row in rows
-                if (row["cell"]["episodes"], row["cell"]["method"]) == (episodes, method)
-            ]
-            for method in METHODS
-        }
-        if all(len(scores) > 1 for scores in found.values()):
-            lines.append([str(episodes), *map(interval_text, found.values())])
-    return {"commands.md": table(["demonstrations", *METHODS], lines).encode()}
+    text = by_demonstrations(rows, EPISODES, list(METHODS))
+    return {"commands.md": text.encode()}
 
 
 BENCHMARK = distillations("commands", __doc__ or "", cells, arguments, draw)

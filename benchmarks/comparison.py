@@ -17,6 +17,7 @@ from benchmarks.tables import table
 __all__ = [
     "Column",
     "Scores",
+    "by_demonstrations",
     "differences_table",
     "draw_methods",
     "draw_scores",
@@ -102,6 +103,23 @@ def scores_text(
     differences = differences_table(scores, pairs, across)
     table_of_scores = scores_table(scores, methods, across)
     return f"{SCORES_NOTE}\n{table_of_scores}\n{DIFFERENCES_NOTE}\n{differences}"
+
+
+def by_demonstrations(rows: Sequence[Row], budgets: Sequence[int], methods: Sequence[str]) -> str:
+    """Return a table of one expert: demonstrations down, methods across; of complete lines."""
+    lines = []
+    for budget in budgets:
+        found = [
+            [
+                row["result"]["normalized_return"]
+                for row in rows
+                if (row["cell"]["episodes"], row["cell"]["method"]) == (budget, method)
+            ]
+            for method in methods
+        ]
+        if all(len(scores) > 1 for scores in found):
+            lines.append([str(budget), *map(interval_text, found)])
+    return f"{SCORES_NOTE}\n{table(['demonstrations', *methods], lines)}"
 
 
 def draw_methods(

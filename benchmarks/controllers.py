@@ -2,9 +2,11 @@
 
 import sys
 from dataclasses import dataclass
+from importlib import import_module
 from pathlib import Path
+from types import ModuleType
 
-__all__ = ["CONTROLLERS", "Controller", "available"]
+__all__ = ["CONTROLLERS", "Controller", "available", "planner"]
 
 HERE = Path(__file__).parent.parent
 OWN, PAPER = HERE / "experts", HERE.parent / "shared" / "experts"
@@ -48,3 +50,11 @@ def available(*names: str) -> list[str]:
     """Return those of the names whose files are here; without names all that move on their own."""
     chosen = names or [name for name in CONTROLLERS if name not in _COMMANDED]
     return [name for name in chosen if CONTROLLERS[name].path.exists()]
+
+
+def planner() -> ModuleType:
+    """Return `examples/constrained_cart_pole.py`: a plant, and a planner with hard limits."""
+    examples = str(HERE / "examples")
+    if examples not in sys.path:
+        sys.path.append(examples)
+    return import_module("constrained_cart_pole")

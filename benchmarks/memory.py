@@ -7,11 +7,10 @@ import gymnasium
 import numpy as np
 
 import fdtasil
+from benchmarks.comparison import by_demonstrations
 from benchmarks.controllers import OWN
 from benchmarks.grid import SEEDS
 from benchmarks.runner import Benchmark, Cell, Row
-from benchmarks.statistics import interval_text
-from benchmarks.tables import table
 
 __all__ = ["BENCHMARK"]
 
@@ -68,19 +67,8 @@ def run(cell: Cell, device: str) -> dict[str, Any]:
 
 def draw(rows: Sequence[Row]) -> dict[str, bytes]:
     """One table: demonstrations down, methods across."""
-    lines = []
-    for episodes in EPISODES:
-        found = [
-            [
-                row["result"]["normalized_return"]
-                for row in rows
-                if (row["cell"]["episodes"], row["cell"]["method"]) == (episodes, method)
-            ]
-            for method in METHODS
-        ]
-        if all(len(scores) > 1 for scores in found):
-            lines.append([str(episodes), *map(interval_text, found)])
-    return {"memory.md": table(["demonstrations", *METHODS], lines).encode()}
+    text = by_demonstrations(rows, EPISODES, list(METHODS))
+    return {"memory.md": text.encode()}
 
 
 BENCHMARK = Benchmark("memory", __doc__ or "", cells, run, draw)

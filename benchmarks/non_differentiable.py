@@ -10,7 +10,7 @@ import fdtasil
 from benchmarks.black_boxes import BLACK_BOXES
 from benchmarks.grid import SEEDS
 from benchmarks.runner import Benchmark, Cell, Row
-from benchmarks.statistics import interval_text
+from benchmarks.statistics import SCORES_NOTE, interval_text
 from benchmarks.tables import table
 
 __all__ = ["BENCHMARK"]
@@ -68,7 +68,7 @@ def draw(rows: Sequence[Row]) -> dict[str, bytes]:
     for kind in BLACK_BOXES:
         mine = [row for row in rows if row["cell"]["black_box"] == kind]
         lines += _line(kind, *(_results(mine, probes) for probes in PROBES))
-    return {"non_differentiable.md": table(heads, lines).encode()}
+    return {"non_differentiable.md": f"{SCORES_NOTE}\n{table(heads, lines)}".encode()}
 
 
 def _results(rows: Sequence[Row], probes: int) -> list[dict[str, Any]]:

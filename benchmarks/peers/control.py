@@ -1,16 +1,15 @@
 """do-mpc's approximate MPC beside this library's student, of one planner with hard limits."""
 
-import sys
 import time
 from collections.abc import Iterator, Sequence
-from importlib import import_module
 from statistics import fmean, median
 from typing import Any
 
 import numpy as np
 
 import fdtasil
-from benchmarks.constrained_mpc import EXAMPLES, HORIZON, METHODS
+from benchmarks.constrained_mpc import HORIZON, METHODS
+from benchmarks.controllers import planner
 from benchmarks.peers.process import ask_peer
 from benchmarks.peers.weights import Policy, arrays_of, checked_policy
 from benchmarks.runner import Cell, Row
@@ -57,10 +56,7 @@ def cells(quick: bool) -> list[Cell]:
 
 def run(cell: Cell) -> dict[str, Any]:
     """Return by method what its student costs, and how it controls."""
-    if str(EXAMPLES) not in sys.path:
-        sys.path.append(str(EXAMPLES))
-    example = import_module("constrained_cart_pole")
-    return (_theirs if "solves" in cell else _ours)(cell, example)
+    return (_theirs if "solves" in cell else _ours)(cell, planner())
 
 
 def _ours(cell: Cell, example: Any) -> dict[str, Any]:

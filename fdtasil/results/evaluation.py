@@ -14,6 +14,7 @@ from fdtasil.files.plain import from_plain, to_plain
 from fdtasil.probes.scales import measure_scales
 from fdtasil.progress import Progress
 from fdtasil.results.smoothness import smoothness_of
+from fdtasil.results.stability import distances
 from fdtasil.rollouts.behaviours import Behaviour, has_none, random_behaviour
 from fdtasil.rollouts.environments import EnvironmentPool
 from fdtasil.rollouts.episodes import Episodes
@@ -353,9 +354,5 @@ def _interval(ours: np.ndarray, theirs: np.ndarray, seed: int) -> tuple[float, f
 
 
 def _imitation_gap(student: Episodes, expert: Episodes) -> float:
-    both = student.valid & expert.valid
     scales = measure_scales(expert.observations[expert.valid])
-    live = scales.live
-    apart = (student.observations - expert.observations)[..., live] / scales.deviation[live]
-    distance = np.sqrt((apart**2).mean(axis=-1))
-    return float(np.where(both, distance, 0.0).max(axis=1).mean())
+    return float(distances(expert, student, scales).mean())
