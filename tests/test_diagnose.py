@@ -10,7 +10,7 @@ from scipy.stats import spearmanr
 from toy_forms import InForm, in_form
 
 import fdtasil
-from fdtasil.errors import SettingError
+from fdtasil.errors import ExpertError, SettingError
 from fdtasil.experts.load import load_expert
 from fdtasil.probes.scales import measure_scales
 from fdtasil.results.fidelity import fidelity_of
@@ -145,6 +145,14 @@ def test_a_gap_is_what_the_law_says(factor):
         linear(GAIN), linear(GAIN), TOY, episodes=2, horizon=30, progress=False
     )
     assert same.gap == same.largest_error == same.fidelity.error == 0
+
+
+def test_a_student_of_another_environment_is_told_so():
+    run = {"episodes": 2, "horizon": 20, "evaluation_episodes": 0, "fit": fdtasil.Fit(steps=5)}
+    result = fdtasil.distill(linear(GAIN), TOY, 0, **run)
+    for judge in (fdtasil.diagnose, fdtasil.evaluate):
+        with pytest.raises(ExpertError, match="has 5 observations, the environment has 4"):
+            judge(result, lqr, "InvertedPendulum-v5", horizon=20)
 
 
 def never(rows):

@@ -1,6 +1,7 @@
 """A policy that is judged, opened for an environment."""
 
 import os
+from dataclasses import replace
 from pathlib import Path
 
 from fdtasil.experts.expert import Expert, Hints
@@ -10,6 +11,7 @@ from fdtasil.experts.structure import in_spaces
 from fdtasil.results.distilled import Distilled
 from fdtasil.rollouts.environments import EnvironmentPool
 from fdtasil.rollouts.spaces import Spaces, flat_layout
+from fdtasil.student.policy import Student
 from fdtasil.student.view import StudentObservation, Unseen
 
 __all__ = ["judged_in", "judged_through"]
@@ -49,6 +51,9 @@ def judged_in(
     """Open a policy that is judged; one that sees a part of the observation takes flat rows."""
     spaces = pool.spaces.unless_plain
     judged = open_expert(policy, Hints(size, pool.boxes.action_size, spaces=spaces))
+    if isinstance(policy, Student):
+        own = {"observation_size": policy.observation_size, "action_size": len(policy.low)}
+        judged = replace(judged, **own)
     if spaces is not None and (not whole or judged.columns is not None):
         spaces = Spaces(flat_layout(size or 1), spaces.actions)
     return in_spaces(judged, spaces)
