@@ -93,8 +93,8 @@ def test_one_that_forgives_less_asks_for_a_higher_order(nu, order):
 
     That is where a path that comes to rest from one side meets one that is pushed to the other.
     """
-    sizes = (3e-4, 6e-4, 1e-3, 2e-3)
-    law = measured(nu, sizes, 1500).law
+    sizes = (6e-4, 1e-3, 2e-3, 3e-3)
+    law = measured(nu, sizes, 700).law
     assert law.settled
     assert law.exponent == pytest.approx(nu, rel=0.1)
     for size in sizes:
@@ -227,7 +227,9 @@ def clipped(rows):
 @pytest.mark.fault(248, 249)
 def test_a_disturbance_that_is_clipped_goes_to_the_other_side():
     """Such an expert is at its bounds nearly everywhere, where half of them would do nothing."""
-    found = fdtasil.diagnose(lambda rows: 0.97 * clipped(rows), clipped, TOY, horizon=30)
+    found = fdtasil.diagnose(
+        lambda rows: 0.97 * clipped(rows), clipped, TOY, episodes=5, horizon=30
+    )
     assert 0 < found.gap <= found.by_law
     assert max(found.stability.sizes) <= 8**0.5 + 1e-6  # from one bound to the other, both actions
     assert found.largest_error > found.stability.law.reach[1]
@@ -238,7 +240,7 @@ def test_a_disturbance_that_is_clipped_goes_to_the_other_side():
 def test_where_deviations_jump_the_law_ends():
     """Of a law that switches: below some size it never switches at another time."""
     switching = lambda rows: np.sign(linear(GAIN)(rows))  # noqa: E731
-    loop = fdtasil.diagnose(switching, switching, TOY, horizon=30).stability
+    loop = fdtasil.diagnose(switching, switching, TOY, episodes=5, horizon=30).stability
     steps = np.array(loop.deviations[1:]) / np.array(loop.deviations[:-1])
     assert steps.max() > 50
     sizes, reached = np.array(loop.sizes), np.array(loop.deviations)
@@ -284,7 +286,7 @@ def test_an_expert_without_an_answer_here_and_there():
         answers[np.abs(np.asarray(rows)[:, 0]) < 0.05] = np.nan
         return answers
 
-    found = fdtasil.diagnose(linear(-0.9 * GAIN), silent, TOY, episodes=5, horizon=30)
+    found = fdtasil.diagnose(linear(-0.9 * GAIN), silent, TOY, episodes=3, horizon=30)
     assert 0 < found.unanswered < 0.5
     assert found.fidelity.answered < 1
     assert found.fidelity.error == pytest.approx(1.9, rel=1e-3)
@@ -374,7 +376,7 @@ def test_rounding_beside_an_offset_is_no_deviation():
             return np.concatenate([400 + 0.3 * self.x, self.x]).astype(np.float32)
 
     expert = lambda rows: np.clip(-0.5 * np.asarray(rows, np.float32)[:, 1:], -1, 1)  # noqa: E731
-    law = fdtasil.diagnose(expert, expert, Offset, horizon=60, steps=60).stability.law
+    law = fdtasil.diagnose(expert, expert, Offset, episodes=3, horizon=60, steps=60).stability.law
     assert law.reach[0] >= 1e-3
     assert law.exponent == pytest.approx(1, abs=0.05)
 

@@ -91,13 +91,14 @@ def test_a_constant_error_ends_where_gamma_says():
 def test_what_a_diagnosis_measures_of_it_is_the_formula(nu):
     """A lasting error e leads 5 e^nu (1 - 0.95^T) away, in whichever direction."""
     expert = load_expert(as_function(make_expert(0)), SIZE, SIZE)
+    reach = 5 * (1 - 0.95**100) / SIZE**0.5
     with EnvironmentPool(lambda: SyntheticSystem(nu, 0)) as pool:
         own = rollout(follow(expert.policy("act")), pool, range(5), 101)
         scales = measure_scales(np.stack([-np.ones(SIZE), np.ones(SIZE)]))
-        found = stability_of(expert, own, pool, 101, np.ones(SIZE), scales, range(5))
+        sizes = (np.geomspace(2e-3, 0.2, 5) / reach) ** (1 / nu)
+        found = stability_of(expert, own, pool, 101, np.ones(SIZE), scales, range(5), sizes)
     law = found.law
     assert law.exponent == pytest.approx(nu, rel=0.02)
-    reach = 5 * (1 - 0.95**100) / SIZE**0.5
     assert law.constant == pytest.approx(reach, rel=0.1)
     assert law.order == {0.5: 2, 1.0: 1, 2.0: 0}[nu]
 
