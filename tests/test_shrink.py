@@ -47,11 +47,18 @@ def test_the_smallest_that_keeps_the_level(run, tmp_path):
     assert [one["bytes"] for one in table["candidates"]] == [o.bytes for o in found.candidates]
     assert (tmp_path / "s" / "sizes.png").stat().st_size > 1000
 
-    # What is finished is taken as it is.
+    # It is judged once more, from starts that it was not chosen by.
+    assert found.confirmed.episodes == found.result.evaluation.episodes
+    assert found.confirmed.expert_return != found.result.evaluation.expert_return
+    assert f"from other starts: {found.confirmed.normalized_return:.3f}" in str(found)
+    assert table["confirmed"]["normalized_return"] == found.confirmed.normalized_return
+
+    # What is finished is taken as it is: nobody is asked but for that last comparison.
     before = len(asked)
     again = fdtasil.shrink(run, counted, TOY, keep=0.8, fit=fit, out=tmp_path / "s", **FAST)
-    assert len(asked) == before
+    assert sum(asked[before:]) <= 2 * FAST["evaluation_episodes"] * FAST["horizon"] + 400
     assert again.candidates == found.candidates
+    assert again.confirmed == found.confirmed
 
 
 def test_none_that_keeps_it(run):

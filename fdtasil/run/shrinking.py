@@ -19,10 +19,10 @@ from fdtasil.files.lock import locked
 from fdtasil.files.storage import write_bytes
 from fdtasil.progress import Progress
 from fdtasil.results.distilled import Distilled
-from fdtasil.results.evaluation import interval_text, score_text
+from fdtasil.results.evaluation import Evaluation, interval_text, score_text
 from fdtasil.results.figures import draw_sizes
 from fdtasil.rollouts.environments import EnvironmentLike
-from fdtasil.run.pipeline import distill
+from fdtasil.run.pipeline import distill, evaluate
 from fdtasil.student.architectures import Mlp
 from fdtasil.student.fit import Fit
 
@@ -37,6 +37,7 @@ LADDER: tuple[tuple[int, ...], ...] = (
     (256, 256),
 )
 """Hidden layers of the students that are tried, the smallest first."""
+_OTHER_STARTS = 1_000  # added to the seed
 
 
 @dataclass(frozen=True)
@@ -83,11 +84,14 @@ class Shrunk:
         keep: Share of the expert's return that was to be kept.
         candidates: All that were tried, with probes and cloned, the smallest first.
         result: The smallest with probes that keeps the share; None where none does.
+        confirmed: The same student from other starts than it was chosen by, which flatter it a
+            little; None with it.
     """
 
     keep: float
     candidates: tuple[Candidate, ...]
     result: Distilled | None
+    confirmed: Evaluation | None = None
 
     @property
     def smallest(self) -> Candidate | None:
@@ -129,6 +133,9 @@ class Shrunk:
             if found is None
             else f"the smallest that keeps {self.keep:.0%}: {found.name}, {found.bytes:,} bytes"
         )
+        if self.confirmed is not None:
+            score = score_text(self.confirmed.normalized_return)
+            lines.append(f"from other starts: {score} {interval_text(self.confirmed.ci95)}")
         return "\n".join(lines)
 
 
@@ -152,7 +159,8 @@ def shrink(
     """Find the smallest student that keeps a share of the expert's return.
 
     Nothing is recorded again: each student learns from the demonstrations of a run, and from the
-    answers that are stored with them; where the run asked a cheap expert anew, so do these.
+    answers that are stored with them; where the run asked a cheap expert anew, so do these. The
+    smallest is judged once more, from starts that it was not chosen by.
 
     Args:
         run: A result, or the folder of one.
@@ -214,7 +222,7 @@ def shrink(
         for job, student in _all(train, jobs, workers):
             found[job] = student
             bar.move(1)
-    shrunk = _judged(found, share)
+    shrunk = _confirmed(_judged(found, share), expert, env, settings)
     if folder is not None:
         _write(shrunk, folder)
     if shrunk.result is None:
@@ -335,6 +343,24 @@ def _judged(found: dict[_Job, Distilled], keep: float) -> Shrunk:
     return Shrunk(keep, tuple(one for one, _ in judged), next(kept, None))
 
 
+def _confirmed(
+    shrunk: Shrunk, expert: ExpertLike, env: EnvironmentLike, settings: dict[str, Any]
+) -> Shrunk:
+    """Judge the student that was chosen from starts that it was not chosen by."""
+    if shrunk.result is None:
+        return shrunk
+    confirmed = evaluate(
+        shrunk.result,
+        expert,
+        env,
+        episodes=settings["evaluation_episodes"],
+        horizon=settings["horizon"],
+        seed=(settings["seed"] + _OTHER_STARTS) % 2**32,
+        progress=False,
+    )
+    return replace(shrunk, confirmed=confirmed)
+
+
 def _candidate(job: _Job, result: Distilled) -> Candidate:
     size, evaluation = result.report["size"]["student"], result.evaluation
     assert evaluation is not None, "there is an expert and an environment"
@@ -354,7 +380,9 @@ def _candidate(job: _Job, result: Distilled) -> Candidate:
 def _write(shrunk: Shrunk, folder: Path) -> None:
     """Write table and picture beside the runs."""
     rows = [vars(one) | {"name": one.name} for one in shrunk.candidates]
-    table = {"keep": shrunk.keep, "candidates": rows}
+    found = shrunk.confirmed
+    confirmed = found and {"normalized_return": found.normalized_return, "ci95": found.ci95}
+    table = {"keep": shrunk.keep, "candidates": rows, "confirmed": confirmed}
     with locked(folder):
         write_bytes(folder / "sizes.json", (json.dumps(table, indent=1) + "\n").encode())
         write_bytes(folder / "sizes.png", shrunk.draw())
