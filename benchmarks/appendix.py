@@ -22,7 +22,7 @@ METHODS: dict[str, dict[str, Any]] = {
     "50": {"probes": "sphere:50"},
 }
 BUDGETS = (1, 2, 5, 10, 20)
-_SEEDS_TOLD = 2  # of which a mean and its interval are told: a cell takes up to forty minutes
+_SEEDS_TOLD = 2  # of a method that is told: a cell takes up to forty minutes
 PAIRS = (("1", "plain"), ("10", "1"), ("50", "1"), ("10", "jacobian"), ("50", "jacobian"))
 
 

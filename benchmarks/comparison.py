@@ -140,7 +140,11 @@ def draw_methods(
     """
     if not scores:
         return {}
-    picture = draw_scores(scores, pictured or methods, label)
+    there = {method for group in scores.values() for method in group}
+    methods = [method for method in methods if method in there]
+    pairs = [pair for pair in pairs if {*pair} <= there]
+    pictured = [method for method in pictured or methods if method in there]
+    picture = draw_scores(scores, pictured, label)
     return {
         f"{name}.png": picture,
         f"{name}.md": scores_text(scores, methods, pairs).encode(),

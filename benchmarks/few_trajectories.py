@@ -47,7 +47,9 @@ PICTURED = (
 PAIRS = (
     ("fresh", "plain, longer"),
     ("fresh", "noise, longer"),
+    ("fresh", "noise"),
     ("fresh", "10 probes, longer"),
+    ("fresh", "10 probes"),
     ("fresh", "fresh, both"),
     ("fresh", "fresh, noise"),
     ("10 probes, both", "10 probes"),

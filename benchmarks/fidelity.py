@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 from statistics import mean, median
 from typing import Any
 
+import numpy as np
 from scipy.stats import spearmanr
 
 import fdtasil
@@ -21,6 +22,7 @@ STUDENTS: dict[str, dict[str, Any]] = {
     "cloned": {"probes": 0},
 }
 ERRORS = ("derivatives", "actions")
+_WELL, _ILL = 0.95, 0.5  # returns of students that do as their experts, and that fail
 
 
 def cells(quick: bool) -> list[Cell]:
@@ -70,6 +72,7 @@ def draw(rows: Sequence[Row]) -> dict[str, bytes]:
         mine = [row for row in rows if row["cell"]["student"] == name]
         lines.append([f"all, {name}", str(len(mine)), *[""] * len(STUDENTS), *_agreements(mine)])
     text = f"Means over seeds; errors are shares of the expert's own.\n\n{table(heads, lines)}\n"
+    text += f"{_range_text(rows)}\n"
     text += "The good students, medians over seeds; distances are the largest within 25 steps of\n"
     text += "ten episodes, in deviations.\n\n"
     heads = ["expert", "seeds with a law", "it was measured up to", "largest error"]
@@ -81,6 +84,19 @@ def draw(rows: Sequence[Row]) -> dict[str, bytes]:
         _laws(e, [row["result"] for row in good if row["cell"]["expert"] == e]) for e in experts
     ]
     return {"fidelity.md": (text + table(heads, [line for line in lines if line])).encode()}
+
+
+def _range_text(rows: Sequence[Row]) -> str:
+    """Return what the errors were of students that do as well as their experts, and that fail."""
+    returns = [row["result"]["normalized_return"] for row in rows]
+    errors = [row["result"]["derivatives"] for row in rows]
+    well = sorted(error for error, score in zip(errors, returns, strict=True) if score >= _WELL)
+    ill = sorted(error for error, score in zip(errors, returns, strict=True) if score < _ILL)
+    parts = []
+    for name, found in ((f"above {_WELL}", well), (f"below {_ILL}", ill)):
+        low, high = np.quantile(found, [0.1, 0.9]) if found else (np.nan, np.nan)
+        parts.append(f"of {len(found)} students {name}, 80 % have {low:.0%} to {high:.0%}")
+    return f"Errors of derivatives by return: {'; '.join(parts)}.\n"
 
 
 def _errors(expert: str, rows: Sequence[Row]) -> list[str]:

@@ -5,7 +5,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from benchmarks.statistics import interquartile_mean, interval
+from benchmarks.statistics import FEWEST, interquartile_mean, interval
 from fdtasil.results.figures import png_of
 
 if TYPE_CHECKING:
@@ -89,7 +89,7 @@ def draw_panels(
     figure.legend(
         handles,
         labels,
-        title="interquartile mean and 95 % bootstrap interval over seeds",
+        title=f"interquartile mean and 95 % interval over seeds (range of fewer than {FEWEST})",
         loc="outside lower center",
         ncols=len(labels),
         fontsize=8,
@@ -100,7 +100,7 @@ def draw_panels(
 
 
 def _styles_of(names: Sequence[str]) -> dict[str, _Style]:
-    """Return a style for each method, and no style twice."""
+    """Return a style for each method, the known ones by their names."""
     left = iter(_OTHERS)
     return {name: _KNOWN.get(name) or next(left) for name in names}
 
@@ -114,7 +114,8 @@ def _draw_curve(
     joined: bool,
 ) -> None:
     means = np.array([interquartile_mean(sample) for sample in values.values()])
-    low, high = np.reshape([interval(sample) for sample in values.values()], (-1, 2)).T
+    spans = [interval(s) if len(s) >= FEWEST else (min(s), max(s)) for s in values.values()]
+    low, high = np.reshape(spans, (-1, 2)).T
     marker, line, grey = style
     panel.errorbar(
         list(values),

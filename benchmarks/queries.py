@@ -99,9 +99,9 @@ def _curves(rows: Sequence[Row]) -> dict[str, Curves]:
 def _at_no_less(
     curves: Curves, ours: tuple[str, int], baseline: str
 ) -> tuple[dict[int, float], float] | None:
-    """Return what a baseline reaches by seed, and how much more it asks, of those who ask no less.
+    """Return what a baseline reaches by seed, and how many times as much it asks.
 
-    Its least budget of these.
+    Of its budgets that ask no less, the least.
 
     No line has to be drawn between its budgets, and what is won is won in spite of what it asks
     more. None where it asks less at its largest.

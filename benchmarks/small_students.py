@@ -32,9 +32,8 @@ WIDTHS = (16, 32, 64, 128, 256)
 _NAMES = {False: "fresh", True: "plain cloning"}  # by whether it is cloned
 _WAYS = ("c", "onnx")
 _CHOSEN = """\
-A student is the smallest whose interval over 20 episodes begins above the level. Its C code is
-judged from the same starts: that says that the code is the student, and on robots that are not
-chaotic nothing more of the choice.
+A student is the smallest whose interval over 20 episodes begins above the level. Its C code was
+judged from the same starts as the student: it tells whether the code is the student.
 """
 
 

@@ -10,6 +10,7 @@ from scipy import stats
 
 __all__ = [
     "DIFFERENCES_NOTE",
+    "FEWEST",
     "SCORES_NOTE",
     "Difference",
     "difference_column",
@@ -21,13 +22,14 @@ __all__ = [
 ]
 
 _RESAMPLES = 2000
-_FEWEST = 5  # seeds that have an interval: of two normal ones it would cover 50 %, of three 75 %
+FEWEST = 5
+"""Seeds that have an interval: of two normal ones it would cover 50 %, of three 75 %."""
 _CHANCE = 0.05
 _trimmed_mean = partial(stats.trim_mean, proportiontocut=0.25)
 
 SCORES_NOTE = f"""\
 Scores are interquartile means over seeds, with 95 % bootstrap intervals (of five normal seeds
-these cover 91 %); fewer than {_FEWEST} seeds are listed one by one.
+these cover 91 %); fewer than {FEWEST} seeds are listed one by one.
 """
 DIFFERENCES_NOTE = """\
 Differences are means on equal seeds, with 95 % intervals by Student's t. **Bold** is significant
@@ -74,7 +76,7 @@ def interval(
 def interval_text(values: Sequence[float], digits: int = 2) -> str:
     """Return the interquartile mean and its interval, or the values where they are few."""
     low, high = interval(values)
-    if len(values) < _FEWEST:
+    if len(values) < FEWEST:
         return ", ".join(f"{value:.{digits}f}" for value in values)
     return f"{interquartile_mean(values):.{digits}f} [{low:.{digits}f}, {high:.{digits}f}]"
 

@@ -14,7 +14,7 @@ from fdtasil.errors import ExpertError, SettingError
 from fdtasil.experts.load import load_expert
 from fdtasil.probes.scales import measure_scales
 from fdtasil.results.fidelity import fidelity_of
-from fdtasil.results.stability import stability_of
+from fdtasil.results.stability import Law, stability_of
 from fdtasil.rollouts.behaviours import follow
 from fdtasil.rollouts.environments import EnvironmentPool
 from fdtasil.rollouts.rollout import rollout
@@ -109,6 +109,31 @@ def test_while_deviations_grow_no_order_is_asked_for():
     assert not law.settled
     assert law.order is None
     assert "a law of these steps" in str(law)
+
+
+@pytest.mark.fault(247)
+def test_half_of_an_episode_that_ends_is_half_of_its_own_steps():
+    """x' = 1.3 x + u, which ends after ten steps of forty."""
+
+    class Growing(PowerLaw):
+        def step(self, action):
+            self.x, self.done = 1.3 * self.x + action, self.done + 1
+            return self.x.copy(), 1.0, self.done == 10, False, {}
+
+        def reset(self, *, seed=None, options=None):
+            self.done = 0
+            return super().reset(seed=seed)
+
+    assert not measured(1.0, (1e-5, 3e-5, 1e-4, 3e-4), 40, Growing).law.settled
+
+
+@pytest.mark.parametrize(
+    ("interval", "said"),
+    [((0.9, 1.0), "1"), ((0.3, 0.7), "1 to 3"), ((-0.1, 0.7), "1 to above 9"), ((1.2, 1.3), "0")],
+)
+def test_orders_of_an_interval(interval, said):
+    law = Law(2.0, sum(interval) / 2, (1e-3, 0.1), (1.0, 2.0), interval, settled=True)
+    assert str(law).endswith(f"order that the theorems ask for: {said}")
 
 
 UNITS = np.ones(2)
@@ -222,6 +247,20 @@ def test_the_command(tmp_path, inside):
 
 def clipped(rows):
     return np.clip(linear(30 * GAIN)(rows), -1, 1)
+
+
+@pytest.mark.fault(248)
+def test_an_expert_at_its_bound_is_disturbed_as_far_as_any():
+    full = lambda rows: np.ones((len(rows), 2), np.float32)  # noqa: E731
+    with EnvironmentPool(TOY) as pool:
+        expert = load_expert(full, 5, 2)
+        own = rollout(follow(expert.policy("act")), pool, [0], 10)
+        scales = measure_scales(np.stack([-np.ones(5), np.ones(5)]))
+        seed = next(s for s in range(99) if np.random.default_rng(s).standard_normal(2).min() > 0)
+        for sizes in ((1e-2,), (0.5,)):
+            found = stability_of(expert, own, pool, 10, UNITS, scales, [seed], sizes)
+            assert found.sizes == pytest.approx(sizes, rel=1e-3)
+            assert found.deviations[0] > 0.1 * sizes[0]
 
 
 @pytest.mark.fault(248, 249)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from fdtasil.probes.scales import Scales
-from fdtasil.results.stability import Law
+from fdtasil.results.stability import NEARLY, Law
 from fdtasil.rollouts.behaviours import Policy
 
 __all__ = ["Condition", "Errors", "conditions_of", "errors_of", "sphere_factor"]
@@ -23,7 +23,6 @@ _DIRECTIONS = 8
 _CHANCE = 0.05
 _AT_ONCE = 64  # directions that are asked along in one batch
 _MOST = 1_000  # coordinates, along each of which both are asked
-_NEARLY = 0.05  # of an exponent: a measured 0.97 is 1
 _LEAST = 1e-12  # that is divided by
 _STARTS = np.geomspace(1e-6, 1.0, 241)  # deviations, in which a path bound is looked for
 
@@ -268,11 +267,11 @@ def conditions_of(errors: Errors, law: Law) -> tuple[Condition, ...]:
         law: Of the expert's loop: gamma(e) = C e^nu, within the reach of its measurement.
     """
     of, found = _Statements(law.constant, law.exponent, *law.reach, errors), []
-    if law.exponent > 1 + _NEARLY:
+    if law.exponent > 1 + NEARLY:
         found.append(of.order_zero())
     if law.exponent > 0.5:
         found.append(of.order_one())
-    if abs(law.exponent - 1) <= _NEARLY:
+    if abs(law.exponent - 1) <= NEARLY:
         found += [of.equal_orders(), of.corollary()]
     return (*found, of.solved())
 

@@ -30,8 +30,8 @@ class Fidelity:
         radii: In standard deviations of each coordinate.
         errors: At each radius the root mean square error of a difference of the student, as a
             share of the expert's own difference. 0 is the expert, 1 a student that does not
-            react. NaN where the expert does not react, or has no answers; infinite where the
-            student has none.
+            react. NaN where the student reacts and the expert does not, or has no answers;
+            infinite where the student has none.
         roughness: What the expert's roughness at 1e-4 deviations (noise, rounding, jumps) is, as
             the same share: of an expert that is random, no error is below it.
         action_error: Of the actions at the states, as a share of how the expert's vary.

@@ -22,7 +22,7 @@ from fdtasil.rollouts.environments import EnvironmentPool
 from fdtasil.rollouts.episodes import Episodes
 from fdtasil.rollouts.rollout import rollout
 
-__all__ = ["Law", "Stability", "distances", "stability_of"]
+__all__ = ["NEARLY", "Law", "Stability", "distances", "stability_of"]
 
 SIZES = tuple(float(f"{size:.1g}") for size in np.geomspace(1e-6, 10**0.5, 14))
 _FAR = 0.3  # deviations: farther apart two paths begin to have nothing to do with each other
@@ -34,7 +34,8 @@ _ABOVE = 2.0  # times as much as was measured, a law may say
 _SETTLED = 0.9  # of the largest distance is reached in the first half of the steps
 _EPISODES = 5  # fewer say nothing of an interval
 _HIGHEST = 9  # order beyond which nobody asks
-_NEARLY = 0.05  # of an exponent: a measured 0.97 is 1
+NEARLY = 0.05
+"""Of an exponent: a measured 0.97 is 1."""
 
 
 @dataclass(frozen=True)
@@ -85,16 +86,17 @@ class Law:
         text += f" (single episodes: {low:.2g} to {high:.2g})"
         if not self.settled:
             return f"{text}; deviations still grow: a law of these steps, that asks for no order"
-        orders = {_order_of(nu) for nu in (self.exponent, *(self.interval or ()))}
-        named = sorted("above 9" if order is None else str(order) for order in orders)
-        return f"{text}; order that the theorems ask for: {' or '.join(named)}"
+        ends = [_order_of(nu) for nu in sorted({self.exponent, *(self.interval or ())})]
+        named = ["above 9" if order is None else str(order) for order in (ends[-1], ends[0])]
+        return f"{text}; order that the theorems ask for: {' to '.join(dict.fromkeys(named))}"
 
 
 def _order_of(exponent: float) -> int | None:
-    if exponent > 1 + _NEARLY:
+    if exponent > 1 + NEARLY:
         return 0
-    order = max(1, math.floor(1 / exponent - 1 + _NEARLY) + 1)
-    return order if order <= _HIGHEST else None
+    if exponent <= 1 / (_HIGHEST + 1):
+        return None
+    return max(1, math.floor(1 / exponent - 1) + 1)
 
 
 @dataclass(frozen=True)
@@ -111,9 +113,9 @@ class Stability:
             become of them is not known, and no law is fitted there.
         law: Fitted to the most sizes in a row that one holds for; None where fewer than four are
             between rounding and 0.3 deviations, or follow no power law.
-        rate: By what the deviation changes in each step after a single action was disturbed, by a
-            fitted exponential; None where it is rounding, or as large as the states vary, at once,
-            or where an episode ends.
+        rate: By what the deviation changes in each step after a single action was disturbed, by
+            fitted exponentials, mean over episodes; None where it is rounding, or as large as the
+            states vary, at once, or where an episode ends.
         rate_interval: 95 % interval of the rate, as the law's; None with it, or of fewer than
             five episodes.
     """
@@ -168,6 +170,7 @@ def stability_of(
         ended = episodes.lengths < own.lengths
         return behaviour.taken, _apart(own, episodes, scales), ended
 
+    first_half = np.arange(horizon) < (own.lengths[:, None] + 1) // 2
     taken, measured, early, ended = [], [], [], []
     for size in sizes:
         found = [followed(size, kind) for kind in ("lasting", "changing")]
@@ -175,7 +178,7 @@ def stability_of(
         apart = np.stack([paths for _, paths, _ in found])
         ended.append(sum(int(over.sum()) for *_, over in found))
         measured.append(_farthest(apart).max(axis=0))
-        early.append(_farthest(apart[..., : (horizon + 1) // 2]).max(axis=0))
+        early.append(_farthest(np.where(first_half, apart, np.nan)).max(axis=0))
     reached, least = np.stack(measured), _least(own, scales)
     whole = np.asarray(ended) == 0
     law = _law_of(np.asarray(taken), reached, np.stack(early), whole, least)
@@ -213,11 +216,9 @@ class _Disturbed:
         answers = self._expert.ask(observations, "evaluate")
         undisturbed = np.asarray(self._inside(answers)[0], np.float64)
         added = self._size * self._units * np.stack([self._direction(random) for random in noise])
-        ends = [undisturbed + side * added for side in (1, -1)]
-        clipped = [
-            self._inside(end.astype(np.float32))[0] != end.astype(np.float32) for end in ends
-        ]
-        moved = np.where(clipped[0] & ~clipped[1], ends[1], ends[0]).astype(np.float32)
+        ends = [(undisturbed + side * added).astype(np.float32) for side in (1, -1)]
+        clipped = [self._inside(end)[0] != end for end in ends]
+        moved = np.where(clipped[0] & ~clipped[1], ends[1], ends[0])
         taken = (self._inside(moved)[0] - undisturbed) / self._units
         sizes = np.linalg.norm(taken, axis=1)
         self.taken = max(self.taken, float(np.max(sizes, where=~np.isnan(sizes), initial=0.0)))
@@ -264,10 +265,10 @@ def _rate(apart: np.ndarray, least: float) -> tuple[float | None, tuple[float, f
     if count < 3:
         return None, None
     steps = np.arange(count)
-    slope, _ = np.polyfit(steps, np.log(means[:count]), 1)
     each = np.log(np.maximum(apart[:, 1 : count + 1], least))
-    between = _interval(np.polyfit(steps, each.T, 1)[0])
-    return float(np.exp(slope)), between and (math.exp(between[0]), math.exp(between[1]))
+    slopes = np.polyfit(steps, each.T, 1)[0]
+    between = _interval(slopes)
+    return math.exp(slopes.mean()), between and (math.exp(between[0]), math.exp(between[1]))
 
 
 def _interval(values: np.ndarray) -> tuple[float, float] | None:

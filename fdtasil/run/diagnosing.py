@@ -1,4 +1,4 @@
-"""Is it trained well enough, and what does the expert forgive: measured and bounded."""
+"""Is it trained well enough, and what does the expert forgive: what can be measured of both."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -110,6 +110,8 @@ class Diagnosis:
 def _of_fidelity(found: Fidelity) -> list[str]:
     if np.isnan(found.error):
         first = f"its expert does not react at a radius of {USUAL}, or has no answers there"
+    elif np.isinf(found.error):
+        first = f"it has no answer at some states, at a radius of {USUAL} from its expert's"
     else:
         first = (
             f"its reactions are off by {found.error:.0%} of its expert's at a radius of {USUAL}"

@@ -52,7 +52,7 @@ def judged_in(
     spaces = pool.spaces.unless_plain
     judged = open_expert(policy, Hints(size, pool.boxes.action_size, spaces=spaces))
     if isinstance(policy, Student):
-        own = {"observation_size": policy.observation_size, "action_size": len(policy.low)}
+        own = {"observation_size": policy.observation_size, "action_size": policy.action_size}
         judged = replace(judged, **own)
     if spaces is not None and (not whole or judged.columns is not None):
         spaces = Spaces(flat_layout(size or 1), spaces.actions)

@@ -222,6 +222,7 @@ def shrink(
         for job, student in _all(train, jobs, workers):
             found[job] = student
             bar.move(1)
+    settings["progress"] = progress
     shrunk = _confirmed(_judged(found, share), expert, env, settings)
     if folder is not None:
         _write(shrunk, folder)
@@ -356,7 +357,7 @@ def _confirmed(
         episodes=settings["evaluation_episodes"],
         horizon=settings["horizon"],
         seed=(settings["seed"] + _OTHER_STARTS) % 2**32,
-        progress=False,
+        progress=settings["progress"],
     )
     return replace(shrunk, confirmed=confirmed)
 
