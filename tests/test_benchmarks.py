@@ -1,6 +1,7 @@
 """The runner of benchmarks: what is done is kept, what fails does not stop the rest."""
 
 import json
+import re
 import shutil
 import subprocess
 import sys
@@ -23,6 +24,7 @@ from benchmarks.statistics import (
     interval_text,
     paired_difference,
 )
+from fdtasil.results.fidelity import GOOD
 
 ROOT = Path(__file__).parent.parent
 
@@ -197,6 +199,13 @@ def test_a_table_is_what_its_rows_say(name, tmp_path, monkeypatch):
     assert main() == 0
     table = f"{name}.md"
     assert (tmp_path / table).read_text() == (FIGURES / table).read_text()
+
+
+def test_what_a_diagnosis_compares_with_is_what_was_measured():
+    table = (FIGURES / "fidelity.md").read_text()
+    well, ill = re.findall(r"80 % have (\d+)% to (\d+)%", table)
+    said = re.findall(r"(\d+) to (\d+) %", GOOD)
+    assert said == [well, ill]
 
 
 @pytest.mark.parametrize("name", ["finite_difference", "mujoco"])

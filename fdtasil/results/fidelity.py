@@ -13,8 +13,8 @@ __all__ = ["GOOD", "USUAL", "Fidelity", "fidelity_of"]
 RADII = (0.03, 0.1, 0.3, 1.0)
 USUAL = 0.3
 """Radius at which differences are compared in one number."""
-GOOD = "students at their expert's return have 20 to 60 %, plain copies that fail 95 to 110 %"
-"""What that number was on eight experts (benchmarks/figures/fidelity.md)."""
+GOOD = "students at their expert's return have 27 to 85 %, those below half of it 86 to 108 %"
+"""What 80 % of the students of nine experts had (benchmarks/figures/fidelity.md)."""
 _DIRECTIONS = 8
 _STILL = 1e-6  # of half its range: an action that varies less does not
 _ROUNDING = 1e-5  # of how actions vary: an expert that changes less does not react
