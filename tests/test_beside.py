@@ -88,6 +88,7 @@ def test_it_ends_with_the_block(run, started):
     assert process.returncode == -signal.SIGKILL
 
 
+@pytest.mark.slow
 def test_it_ends_with_a_parent_that_is_killed(run, tmp_path):
     script = f"""
 import fdtasil.shell.beside as beside

@@ -465,7 +465,13 @@ def bomb(path, model):
 
 @pytest.mark.fault(21)
 @pytest.mark.parametrize(
-    "model", [sum_of_many(2 * 10**9), sum_of_many(10**12), sum_of_many(10**18), doubled(60, "one")]
+    "model",
+    [
+        sum_of_many(2 * 10**9),
+        sum_of_many(10**12),
+        sum_of_many(10**18),
+        pytest.param(doubled(60, "one"), marks=pytest.mark.slow),
+    ],
 )
 def test_a_small_file_that_unpacks_to_gigabytes(model, tmp_path):
     text = refused(bomb(tmp_path / "e.onnx", model))

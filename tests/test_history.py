@@ -116,6 +116,7 @@ class Differences:
         return np.clip(-2 * observation - 2 * speed, -3, 3), (observation, np.ones_like(known))
 
 
+@pytest.mark.slow
 def test_a_hidden_speed_is_learnt_from_the_past():
     run = {"episodes": 3, "horizon": 60, "fit": fdtasil.Fit(steps=2000), "progress": False}
     run |= {"student": fdtasil.Mlp(64), "evaluation_episodes": 10}
