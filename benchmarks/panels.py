@@ -65,7 +65,8 @@ def draw_panels(
 
     across_page = min(_ABREAST, len(experts))
     down = -(-len(experts) // across_page)
-    figure = Figure(figsize=(3.4 * across_page, 0.4 + 3.2 * down), layout="constrained")
+    height = 3.2 if across else 4.0  # names that stand upright take room
+    figure = Figure(figsize=(3.4 * across_page, 0.4 + height * down), layout="constrained")
     grid = figure.subplots(down, across_page, sharey=True, squeeze=False)
     panels = list(grid.flat)
     for panel in panels[len(experts) :]:
