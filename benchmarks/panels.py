@@ -115,8 +115,7 @@ def _draw_curve(
     joined: bool,
 ) -> None:
     means = np.array([interquartile_mean(sample) for sample in values.values()])
-    spans = [interval(s) if len(s) >= FEWEST else (min(s), max(s)) for s in values.values()]
-    low, high = np.reshape(spans, (-1, 2)).T
+    low, high = np.reshape([interval(sample) for sample in values.values()], (-1, 2)).T
     marker, line, grey = style
     panel.errorbar(
         list(values),

@@ -85,7 +85,7 @@ class Diagnosis:
 
     def __str__(self) -> str:
         lines = [*_of_fidelity(self.fidelity), *_of_stability(self.stability)]
-        silent = f", and none at {self.unanswered:.0%} of it" if self.unanswered else ""
+        silent = f", not known at {self.unanswered:.0%} of it" if self.unanswered else ""
         lines.append(
             f"the student's largest error on its own path: {self.largest_error:.2g}{silent}"
         )
