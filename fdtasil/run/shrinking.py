@@ -26,7 +26,7 @@ from fdtasil.run.pipeline import distill, evaluate
 from fdtasil.student.architectures import Mlp
 from fdtasil.student.fit import Fit
 
-__all__ = ["LADDER", "Candidate", "Shrunk", "shrink"]
+__all__ = ["LADDER", "OTHER_STARTS", "Candidate", "Shrunk", "shrink"]
 
 LADDER: tuple[tuple[int, ...], ...] = (
     (8, 8),
@@ -37,7 +37,8 @@ LADDER: tuple[tuple[int, ...], ...] = (
     (256, 256),
 )
 """Hidden layers of the students that are tried, the smallest first."""
-_OTHER_STARTS = 1_000  # added to the seed
+OTHER_STARTS = 1_000
+"""Added to the seed, for the starts by which the chosen student is judged once more."""
 
 
 @dataclass(frozen=True)
@@ -356,7 +357,7 @@ def _confirmed(
         env,
         episodes=settings["evaluation_episodes"],
         horizon=settings["horizon"],
-        seed=(settings["seed"] + _OTHER_STARTS) % 2**32,
+        seed=(settings["seed"] + OTHER_STARTS) % 2**32,
         progress=settings["progress"],
     )
     return replace(shrunk, confirmed=confirmed)
