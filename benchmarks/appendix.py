@@ -4,10 +4,11 @@ from collections import Counter
 from collections.abc import Sequence
 from typing import Any
 
-from benchmarks.comparison import draw_scores, scores_of, scores_text
+from benchmarks.comparison import draw_scores
 from benchmarks.distillation import HORIZON, distillations
 from benchmarks.grid import SEEDS, experts, label
 from benchmarks.runner import Cell, Row
+from benchmarks.scores import scores_of, scores_text
 from benchmarks.statistics import interval_text
 from benchmarks.tables import table
 

@@ -3,10 +3,10 @@
 from collections.abc import Sequence
 from typing import Any
 
-from benchmarks.comparison import by_demonstrations
 from benchmarks.distillation import distillations
 from benchmarks.grid import SEEDS
 from benchmarks.runner import Cell, Row
+from benchmarks.scores import by_demonstrations
 
 __all__ = ["BENCHMARK"]
 

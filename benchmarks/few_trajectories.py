@@ -7,10 +7,11 @@ from typing import Any
 import numpy as np
 
 import fdtasil
-from benchmarks.comparison import draw_methods, scores_of
+from benchmarks.comparison import draw_methods
 from benchmarks.distillation import HORIZON, distil, recorded
 from benchmarks.grid import SEEDS, experts, side_by_side
 from benchmarks.runner import Benchmark, Cell, Row
+from benchmarks.scores import scores_of
 from fdtasil.probes.answers import Answers
 from fdtasil.probes.scales import measure_scales
 

@@ -3,10 +3,11 @@
 from collections.abc import Sequence
 from typing import Any
 
-from benchmarks.comparison import draw_scores, scores_of, scores_text
+from benchmarks.comparison import draw_scores
 from benchmarks.distillation import distillations, usual_arguments
 from benchmarks.grid import SEEDS, STANDARD_METHODS, experts, label
 from benchmarks.runner import Cell, Row
+from benchmarks.scores import scores_of, scores_text
 
 __all__ = ["BENCHMARK"]
 

@@ -7,10 +7,10 @@ import gymnasium
 import numpy as np
 
 import fdtasil
-from benchmarks.comparison import by_demonstrations
 from benchmarks.controllers import OWN
 from benchmarks.grid import SEEDS
 from benchmarks.runner import Benchmark, Cell, Row
+from benchmarks.scores import by_demonstrations
 
 __all__ = ["BENCHMARK"]
 

@@ -3,11 +3,12 @@
 from collections.abc import Sequence
 from typing import Any
 
-from benchmarks.comparison import Column, Scores, draw_scores, scores_of, scores_text
+from benchmarks.comparison import draw_scores
 from benchmarks.controllers import available
 from benchmarks.distillation import distillations, usual_arguments
 from benchmarks.grid import SEEDS, experts, side_by_side
 from benchmarks.runner import Cell, Row
+from benchmarks.scores import Column, Scores, scores_of, scores_text
 
 __all__ = ["BENCHMARK"]
 

@@ -8,12 +8,13 @@ import gymnasium
 import numpy as np
 
 import fdtasil
-from benchmarks.comparison import Column, Scores, draw_scores, scores_text
+from benchmarks.comparison import draw_scores
 from benchmarks.controllers import CONTROLLERS
 from benchmarks.distillation import HORIZON, call_of
 from benchmarks.disturbances import DISTURBANCES, STEPS_BETWEEN_PUSHES, Disturbance
 from benchmarks.grid import SEEDS, STANDARD_METHODS, experts, label
 from benchmarks.runner import Benchmark, Cell, Row
+from benchmarks.scores import Column, Scores, scores_text
 
 __all__ = ["BENCHMARK"]
 

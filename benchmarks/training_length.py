@@ -3,10 +3,11 @@
 from collections.abc import Sequence
 from typing import Any
 
-from benchmarks.comparison import draw_methods, scores_of
+from benchmarks.comparison import draw_methods
 from benchmarks.distillation import STEPS, distillations, usual_arguments
 from benchmarks.grid import SEEDS, experts
 from benchmarks.runner import Cell, Row
+from benchmarks.scores import scores_of
 
 __all__ = ["BENCHMARK"]
 
