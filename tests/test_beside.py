@@ -48,7 +48,7 @@ def started(monkeypatch):
             super().__init__(*arguments, **named)
             found.append(self)
 
-    monkeypatch.setattr("fdtasil.shell.beside.subprocess.Popen", Noted)
+    monkeypatch.setattr("fdtasil.run.elsewhere.subprocess.Popen", Noted)
     return found
 
 
@@ -91,13 +91,14 @@ def test_it_ends_with_the_block(run, started):
 @pytest.mark.slow
 def test_it_ends_with_a_parent_that_is_killed(run, tmp_path):
     script = f"""
+import fdtasil.run.elsewhere as elsewhere
 import fdtasil.shell.beside as beside
-Popen = beside.subprocess.Popen
+Popen = elsewhere.subprocess.Popen
 def noted(*arguments, **named):
     process = Popen(*arguments, **named)
     print(process.pid, flush=True)
     return process
-beside.subprocess.Popen = noted
+elsewhere.subprocess.Popen = noted
 with beside.evaluated_beside({ {**run, **ENDLESS}!r}) as cloning:
     cloning()
 """

@@ -1,6 +1,11 @@
 """Students of several sizes from one run's answers: nothing recorded again, resumable, judged."""
 
 import json
+import os
+import subprocess
+import sys
+import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -8,6 +13,7 @@ from conftest import GAIN, QUICK, TOY, mlp_onnx
 
 import fdtasil
 from fdtasil.errors import FdtasilWarning, SettingError
+from fdtasil.run.elsewhere import side_by_side
 
 pytestmark = pytest.mark.usefixtures("no_pictures")
 SIZES = [(2,), (16, 16)]
@@ -116,8 +122,77 @@ def test_micro():
 def test_another_call_in_the_same_folder_is_refused(run, tmp_path):
     options = {**FAST, "fit": fdtasil.Fit(steps=5), "cloned": False, "keep": 0.0}
     fdtasil.shrink(run, law, TOY, **options, out=tmp_path / "s")
-    with pytest.raises(SettingError, match="seed 0"):
+    with pytest.raises(SettingError, match="seed was 0, is 1"):
         fdtasil.shrink(run, law, TOY, **options, seed=1, out=tmp_path / "s")
+    with pytest.raises(SettingError, match=r"fit\.steps was 5, is 6"):
+        fdtasil.shrink(
+            run, law, TOY, **{**options, "fit": fdtasil.Fit(steps=6)}, out=tmp_path / "s"
+        )
+
+
+def test_a_killed_one_goes_on(run, tmp_path, monkeypatch):
+    """Within a student's training, and to the same bytes."""
+    options = {**FAST, "fit": fdtasil.Fit(steps=300), "cloned": False, "keep": 0.0}
+    whole = fdtasil.shrink(run, law, TOY, **options, out=tmp_path / "whole")
+    monkeypatch.setattr("fdtasil.run.folder.CHECKPOINT_SECONDS", 0.0)
+    with monkeypatch.context() as patched:
+        patched.setattr("fdtasil.run.pipeline.evaluate_pair", _interrupt)
+        with pytest.raises(KeyboardInterrupt):
+            fdtasil.shrink(run, law, TOY, **options, out=tmp_path / "killed")
+    again = fdtasil.shrink(run, law, TOY, **options, out=tmp_path / "killed")
+    assert [one.ci95 for one in again.candidates] == [one.ci95 for one in whole.candidates]
+    parts = [(tmp_path / f / "2-relu" / "student.onnx").read_bytes() for f in ("whole", "killed")]
+    assert parts[0] == parts[1]
+
+
+def _interrupt(*_):
+    raise KeyboardInterrupt
+
+
+def test_cloned_ones_train_as_long_as_those_that_ask_anew(tmp_path):
+    expert = str(mlp_onnx(tmp_path / "e.onnx"))
+    fit = fdtasil.Fit(epochs=3)
+    run = fdtasil.distill(expert, TOY, "fresh", **{**QUICK, "fit": fit})
+    fdtasil.shrink(run, expert, TOY, fit=fit, keep=0.0, out=tmp_path / "s", **FAST)
+    students = [fdtasil.Distilled.load(tmp_path / "s" / f"2-relu{c}") for c in ("", "-cloned")]
+    asked, plain = (one.report["steps"] for one in students)
+    assert asked == plain
+    assert students[1].settings["probes"] == "none"
+
+
+@pytest.mark.slow
+def test_a_script_without_a_guard_runs_once(tmp_path):
+    expert = mlp_onnx(tmp_path / "e.onnx")
+    fdtasil.distill(str(expert), TOY, 2, **QUICK).save(tmp_path / "run")
+    script = tmp_path / "script.py"
+    script.write_text(f"""
+import fdtasil
+print("begun")
+found = fdtasil.shrink(
+    "run", "e.onnx", "{TOY}", sizes=[(2,), (3,)], cloned=False, workers=2,
+    keep=0.0, horizon=20, evaluation_episodes=2, fit=fdtasil.Fit(steps=5),
+)
+print(len(found.candidates))
+""")
+    paths = {**os.environ, "PYTHONPATH": str(Path(__file__).parent)}
+    done = subprocess.run(
+        [sys.executable, script], cwd=tmp_path, env=paths, capture_output=True, text=True
+    )
+    assert done.stdout.split() == ["begun", "2"], done.stderr
+
+
+def test_a_failure_side_by_side_ends_the_others():
+    begun = time.monotonic()
+    with pytest.raises(SettingError, match="the first"):
+        for _ in side_by_side(str, _fail_or_sleep, [0, 60, 60, 60], 2):
+            pass
+    assert time.monotonic() - begun < 30
+
+
+def _fail_or_sleep(seconds):
+    if not seconds:
+        raise SettingError("the first", "another", "none")
+    time.sleep(seconds)
 
 
 def test_students_see_what_the_runs_student_saw():

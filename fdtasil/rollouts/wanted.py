@@ -1,6 +1,10 @@
 """An environment that is not made yet, with what it is to be made and reset with."""
 
+import importlib
+import os
+import sys
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Any
 
@@ -10,7 +14,7 @@ from fdtasil.checks import check_count, spelt
 from fdtasil.errors import EnvironmentFault, SettingError
 from fdtasil.rollouts.vector import make_vector, vector_of
 
-__all__ = ["Environment"]
+__all__ = ["Environment", "import_module_of"]
 
 
 @dataclass(frozen=True)
@@ -76,3 +80,20 @@ class Environment:
             "a gymnasium id, an environment, or a function that makes one",
             'write for example env="HalfCheetah-v5"',
         )
+
+
+def import_module_of(environment: str | None) -> None:
+    """Import the module of "module:Id" where it lies in the current folder.
+
+    Nothing else is looked for there: a folder that somebody else filled runs no code by itself.
+    """
+    module, named, _ = (environment or "").partition(":")
+    here = os.getcwd()
+    if not named or here in sys.path:
+        return
+    sys.path.append(here)
+    try:
+        with suppress(ImportError):  # gymnasium says what is missing
+            importlib.import_module(module)
+    finally:
+        sys.path.remove(here)

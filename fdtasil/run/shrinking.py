@@ -1,15 +1,14 @@
 """The smallest student that keeps the expert's level, from the answers that are there."""
 
 import json
-from collections.abc import Callable, Sequence
-from concurrent.futures import ProcessPoolExecutor, as_completed
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
-from multiprocessing import get_context
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any
 
-import numpy as np
 import torch
 
 from fdtasil.checks import check_count, check_flag, check_path, check_share
@@ -22,6 +21,9 @@ from fdtasil.results.distilled import Distilled
 from fdtasil.results.evaluation import Evaluation, interval_text, score_text
 from fdtasil.results.figures import draw_sizes
 from fdtasil.rollouts.environments import EnvironmentLike
+from fdtasil.rollouts.wanted import Environment, import_module_of
+from fdtasil.run.elsewhere import side_by_side
+from fdtasil.run.folder import RunFolder
 from fdtasil.run.pipeline import distill, evaluate
 from fdtasil.student.architectures import Mlp
 from fdtasil.student.fit import Fit
@@ -161,7 +163,8 @@ def shrink(
 
     Nothing is recorded again: each student learns from the demonstrations of a run, and from the
     answers that are stored with them; where the run asked a cheap expert anew, so do these. The
-    smallest is judged once more, from starts that it was not chosen by.
+    smallest is judged once more, from starts that it was not chosen by. Those that are cloned
+    take as many steps as those with probes.
 
     Args:
         run: A result, or the folder of one.
@@ -175,14 +178,14 @@ def shrink(
         horizon: As in `distill`; left out, the run's.
         seed: Left out, the run's.
         fit: As in `distill`.
-        out: Folder of the runs, one for each student; those that are finished are taken as they
-            are, so that it may be killed and begun again.
+        out: Folder of the runs, one for each student. What is done in it is taken up, so that it
+            may be killed and begun again.
         workers: Students that are trained side by side, in processes; the expert must be a path
             or an address then, and the environment an id.
         progress: Show a progress bar, in a terminal or a notebook.
 
     Raises:
-        SettingError: If an argument can't be used.
+        SettingError: If an argument can't be used, or `out` holds students of another call.
 
     Example::
 
@@ -192,8 +195,9 @@ def shrink(
     """
     share, workers = check_share("keep", keep), check_count("workers", workers)
     result = run if isinstance(run, Distilled) else Distilled.load(check_path("run", run))
-    jobs = _jobs(sizes, activations, cloned=check_flag("cloned", cloned))
-    if workers > 1 and not (isinstance(expert, str | Path) and isinstance(env, str)):
+    jobs = _jobs(sizes, activations)
+    cloned = check_flag("cloned", cloned)
+    if workers > 1 and not (isinstance(expert, str | Path) and _id_of(env)):
         raise SettingError(
             f"workers={workers} with an expert or an environment of this process",
             "a path or an address, and an id",
@@ -215,21 +219,25 @@ def shrink(
         "fit": fit,
         "progress": False,
     }
-    names = ("expert_sha256", "env") if result.settings["horizon"] else ()
-    about = {name: result.settings[name] for name in names}
-    train = partial(_trained, expert, env, settings, about, folder)
     found = dict[_Job, Distilled]()
-    with Progress(check_flag("progress", progress)).bar("students", "student", len(jobs)) as bar:
-        for job, student in _all(train, jobs, workers):
-            found[job] = student
-            bar.move(1)
+    count, bars = len(jobs) * (1 + cloned), Progress(check_flag("progress", progress))
+    with _place_of(folder, workers) as place, bars.bar("students", "student", count) as bar:
+        train = partial(_trained, expert, env, settings, place)
+
+        def train_all(jobs: Sequence[_Job]) -> None:
+            for job, student in _all(train, jobs, place, _id_of(env), workers):
+                found[job] = student
+                bar.move(1)
+
+        train_all(jobs)
+        if cloned:  # as long as its counterpart, which may have asked anew and trained for longer
+            train_all([replace(job, cloned=found[job].report["steps"]) for job in jobs])
     settings["progress"] = progress
     shrunk = _confirmed(_judged(found, share), expert, env, settings)
     if folder is not None:
         _write(shrunk, folder)
     if shrunk.result is None:
-        count = sum(not job.cloned for job in jobs)
-        warn(f"no student of {count} keeps {share:.0%} of the expert's return")
+        warn(f"no student of {len(jobs)} keeps {share:.0%} of the expert's return")
     return shrunk
 
 
@@ -249,93 +257,96 @@ def _seen(result: Distilled) -> tuple[int, ...] | None:
     return result.view.columns if result.dataset.history == 1 else None
 
 
+def _id_of(env: EnvironmentLike) -> str | None:
+    """Return the id that other processes can make the environment by, if there is one."""
+    found = env.environment if isinstance(env, Environment) else env
+    return found if isinstance(found, str) else None
+
+
 @dataclass(frozen=True)
 class _Job:
+    """A student to train.
+
+    Attributes:
+        hidden: Widths of its hidden layers.
+        activation: Between them.
+        cloned: For how many steps it is cloned plainly; None with probes.
+    """
+
     hidden: tuple[int, ...]
     activation: str
-    cloned: bool
+    cloned: int | None = None
 
     @property
     def folder(self) -> str:
+        """Where it is kept."""
         widths = "x".join(map(str, self.hidden)) or "linear"
-        return f"{widths}-{self.activation}{'-cloned' * self.cloned}"
+        return f"{widths}-{self.activation}{'' if self.cloned is None else '-cloned'}"
 
 
-def _jobs(
-    sizes: Sequence[tuple[int, ...]], activations: Sequence[str], *, cloned: bool
-) -> list[_Job]:
-    """Return what is to be trained; what can't be built is refused before anything is."""
+def _jobs(sizes: Sequence[tuple[int, ...]], activations: Sequence[str]) -> list[_Job]:
+    """Return the students with probes; what can't be built is refused before anything is."""
     jobs = []
     for hidden in sizes:
         for activation in activations:
             widths = Mlp(hidden, activation).hidden
             assert isinstance(widths, tuple)
-            jobs += [_Job(widths, activation, plain) for plain in ((False, True)[: 1 + cloned])]
+            jobs.append(_Job(widths, activation))
     if not jobs:
         raise SettingError("no sizes", "one student at least", "leave sizes= out")
     return jobs
 
 
+@contextmanager
+def _place_of(folder: Path | None, workers: int) -> Iterator[Path | None]:
+    """Yield where the runs are kept: other processes have no other way to hand them over."""
+    if folder is not None or workers == 1:
+        yield folder
+        return
+    with TemporaryDirectory() as place:
+        yield Path(place)
+
+
 def _all(
-    train: Callable[[_Job], Distilled], jobs: Sequence[_Job], workers: int
-) -> "Sequence[tuple[_Job, Distilled]] | Any":
-    if workers == 1:
+    train: Callable[[_Job], Distilled],
+    jobs: Sequence[_Job],
+    place: Path | None,
+    env: str | None,
+    workers: int,
+) -> Iterator[tuple[_Job, Distilled]]:
+    if workers == 1 or place is None:
         yield from ((job, train(job)) for job in jobs)
         return
-    # Fresh processes: a copy of this one would have its threads' locks, and not its threads.
-    with ProcessPoolExecutor(workers, get_context("spawn"), torch.set_num_threads, (1,)) as pool:
-        started = {pool.submit(train, job): job for job in jobs}
-        for done in as_completed(started):
-            yield started[done], done.result()
+    alone = partial(_trained_alone, train, env)
+    for job, _ in side_by_side(lambda job: f"the student {job.folder}", alone, jobs, workers):
+        yield job, Distilled.load(place / job.folder)
+
+
+def _trained_alone(train: Callable[[_Job], Distilled], env: str | None, job: _Job) -> None:
+    """Train a student in a process of its own, which hands it over as its folder."""
+    torch.set_num_threads(1)
+    import_module_of(env)
+    train(job)
 
 
 def _trained(
     expert: ExpertLike,
     env: EnvironmentLike,
     settings: dict[str, Any],
-    about: dict[str, Any],
     folder: Path | None,
     job: _Job,
 ) -> Distilled:
-    place = None if folder is None else folder / job.folder
-    if place is not None and (place / "manifest.json").exists():
-        return _checked(Distilled.load(place), settings, about, place)
-    given = dict(settings)
-    if job.cloned:
+    given, probes = dict(settings), None
+    if job.cloned is not None:
         given["dataset"] = replace(settings["dataset"], probes=None, answers=None)
-    return distill(
-        expert,
-        env,
-        0 if job.cloned else None,
-        student=Mlp(job.hidden, job.activation),
-        out=place,
-        **given,
-    )
-
-
-def _checked(
-    done: Distilled, settings: dict[str, Any], run: dict[str, Any], place: Path
-) -> Distilled:
-    """Return what is finished in a folder, if it is what would be made now."""
-    ours = {name: settings[name] for name in ("evaluation_episodes", "horizon", "seed")}
-    theirs = {name: done.settings.get(name) for name in ours}
-    ours |= run
-    theirs |= {name: done.settings.get(name) for name in run}
-    ours["states"], theirs["states"] = (
-        len(settings["dataset"].demonstrations),
-        done.report["states"],
-    )
-    same = np.array_equal(
-        settings["dataset"].demonstrations.observations, done.demonstrations.observations
-    )
-    if ours == theirs and same and done.evaluation is not None:
-        return done
-    apart = [f"{name} {theirs[name]}" for name in ours if ours[name] != theirs[name]]
-    raise SettingError(
-        f"{place} holds a student of another call ({', '.join(apart) or 'other demonstrations'})",
-        "a folder of the same call, which was interrupted",
-        "write another out=, or remove that folder",
-    )
+        given["fit"] = replace(settings["fit"] or Fit(), steps=job.cloned, epochs=None)
+        probes = 0
+    if folder is not None:
+        place = folder / job.folder
+        kept = RunFolder(place, {})
+        given["resume" if kept.begun or kept.finished else "out"] = place
+    student = Mlp(job.hidden, job.activation)
+    return distill(expert, env, probes, student=student, **given)
 
 
 def _judged(found: dict[_Job, Distilled], keep: float) -> Shrunk:
@@ -369,7 +380,7 @@ def _candidate(job: _Job, result: Distilled) -> Candidate:
     return Candidate(
         job.hidden,
         job.activation,
-        job.cloned,
+        job.cloned is not None,
         size["bytes"],
         size["multiply_adds"],
         size["microseconds"],

@@ -1,12 +1,8 @@
 """Functions of the library as commands: signatures and docstrings, as a shell can say them."""
 
-import importlib
 import inspect
-import os
 import re
-import sys
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import NoneType, UnionType
@@ -25,7 +21,6 @@ __all__ = [
     "PolicyPath",
     "RunFolder",
     "as_command",
-    "import_module_of",
 ]
 
 OptionalExpert = Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="EXPERT")]
@@ -120,20 +115,3 @@ def as_command(
     lines = [f"    {name}: {text}" for name, text in texts.items()]
     command.__doc__ = f"{head}Args:\n" + "\n".join(lines)
     return command
-
-
-def import_module_of(environment: str | None) -> None:
-    """Import the module of "module:Id" where it lies in the current folder.
-
-    Nothing else is looked for there: a folder that somebody else filled runs no code by itself.
-    """
-    module, named, _ = (environment or "").partition(":")
-    here = os.getcwd()
-    if not named or here in sys.path:
-        return
-    sys.path.append(here)
-    try:
-        with suppress(ImportError):  # gymnasium says what is missing
-            importlib.import_module(module)
-    finally:
-        sys.path.remove(here)

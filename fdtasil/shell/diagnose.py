@@ -2,9 +2,10 @@
 
 from typing import Any
 
+from fdtasil.rollouts.wanted import import_module_of
 from fdtasil.run.diagnosing import diagnose
 from fdtasil.shell.call import wanted
-from fdtasil.shell.command import EnvironmentId, Flags, PolicyPath, as_command, import_module_of
+from fdtasil.shell.command import EnvironmentId, Flags, PolicyPath, as_command
 
 __all__ = ["command"]
 

@@ -21,6 +21,7 @@ from fdtasil.files.storage import is_written, remove_file, remove_if_empty, writ
 from fdtasil.results.distilled import Distilled
 from fdtasil.results.evaluation import Evaluation, interval_text, score_text
 from fdtasil.results.size import size_text
+from fdtasil.rollouts.wanted import import_module_of
 from fdtasil.run.pipeline import distill
 from fdtasil.shell.beside import evaluated_beside
 from fdtasil.shell.call import ENVIRONMENT_FLAGS, distil
@@ -30,7 +31,6 @@ from fdtasil.shell.command import (
     OptionalExpert,
     OptionalText,
     as_command,
-    import_module_of,
 )
 from fdtasil.student.architectures import Mlp
 from fdtasil.student.fit import Fit

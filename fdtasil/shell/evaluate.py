@@ -3,9 +3,10 @@
 from typing import Any
 
 from fdtasil.experts.load import load_expert
+from fdtasil.rollouts.wanted import import_module_of
 from fdtasil.run.pipeline import evaluate
 from fdtasil.shell.call import ENVIRONMENT_FLAGS, opened, seen, wanted
-from fdtasil.shell.command import EnvironmentId, Flags, PolicyPath, as_command, import_module_of
+from fdtasil.shell.command import EnvironmentId, Flags, PolicyPath, as_command
 
 __all__ = ["command"]
 

@@ -12,8 +12,9 @@ from fdtasil.files.storage import write_bytes
 from fdtasil.probes.gains import Gains, gains
 from fdtasil.probes.scales import measure_scales
 from fdtasil.rollouts.environments import EnvironmentPool
+from fdtasil.rollouts.wanted import import_module_of
 from fdtasil.shell.call import opened, wanted
-from fdtasil.shell.command import EnvironmentId, ExpertPath, import_module_of
+from fdtasil.shell.command import EnvironmentId, ExpertPath
 
 __all__ = ["command"]
 

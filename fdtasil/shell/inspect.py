@@ -11,10 +11,11 @@ from fdtasil.probes.calibration import Calibration, calibrate
 from fdtasil.probes.scales import measure_scales
 from fdtasil.results.figures import draw_calibration
 from fdtasil.rollouts.environments import EnvironmentPool
+from fdtasil.rollouts.wanted import import_module_of
 from fdtasil.run.presets import PRESETS
 from fdtasil.seeding import generator
 from fdtasil.shell.call import opened, wanted
-from fdtasil.shell.command import EnvironmentId, ExpertPath, import_module_of
+from fdtasil.shell.command import EnvironmentId, ExpertPath
 
 __all__ = ["command"]
 

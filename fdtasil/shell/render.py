@@ -3,9 +3,10 @@
 from pathlib import Path
 
 from fdtasil.errors import SettingError
+from fdtasil.rollouts.wanted import import_module_of
 from fdtasil.run.film import choose_renderer, render
 from fdtasil.shell.call import wanted
-from fdtasil.shell.command import EnvironmentId, import_module_of
+from fdtasil.shell.command import EnvironmentId
 
 __all__ = ["command"]
 

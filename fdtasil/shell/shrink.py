@@ -2,10 +2,11 @@
 
 from pathlib import Path
 
+from fdtasil.rollouts.wanted import import_module_of
 from fdtasil.run.presets import preset_of
 from fdtasil.run.shrinking import shrink
 from fdtasil.shell.call import wanted
-from fdtasil.shell.command import EnvironmentId, ExpertPath, RunFolder, import_module_of
+from fdtasil.shell.command import EnvironmentId, ExpertPath, RunFolder
 
 __all__ = ["command"]
 
