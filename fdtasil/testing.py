@@ -8,6 +8,7 @@ from fdtasil.experts.expert import Expert
 from fdtasil.experts.gate import Finding
 from fdtasil.experts.load import ExpertLike
 from fdtasil.files.onnx.export import export_module
+from fdtasil.rollouts.behaviours import has_none
 from fdtasil.rollouts.environments import Boxes, EnvironmentLike, EnvironmentPool
 from fdtasil.rollouts.episodes import Episodes
 from fdtasil.student.policy import Student
@@ -98,7 +99,8 @@ def _far(expert: Expert, states: np.ndarray, boxes: Boxes) -> Finding:
         answers = expert.ask((states * _FAR).astype(np.float32), "check")
     except ExpertError as error:
         return Finding(name, error.found, error)
-    beyond = float(np.maximum(answers - boxes.high, boxes.low - answers).max())
+    answers = answers[~has_none(answers)]
+    beyond = float(np.maximum(answers - boxes.high, boxes.low - answers).max(initial=0.0))
     if beyond <= 1e-4:
         return Finding(name, f"bounded at {_FAR:g} times the states", None)
     found = f"{expert.name} leaves the action bounds by {beyond:.2g} at {_FAR:g} times the states"

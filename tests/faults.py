@@ -225,6 +225,9 @@ FAULTS = {
         210: "derivatives that are not those of the actions",
         211: "compiled code with static buffers, asked by several threads",
         212: "a machine of a cluster that is lost with a batch",
+        258: "a worker that dies in the middle of an answer",
+        259: "a download that goes on after it was given up",
+        264: "an actor of a cluster that was ended, and begun again",
     },
     "spaces and vector environments": {
         213: "an observation that is not what its space promises",
@@ -275,6 +278,11 @@ FAULTS = {
         244: "a number where a file for robots expects an observation",
         245: "a line of too few or too many numbers, for the program in C",
         246: "an expert that is gone, and asked row by row",
+        257: "a search for the smallest student that was killed, or goes on with other settings",
+        262: "a planner without an answer, in a film",
+        263: "a row without an answer, which hides what is wrong with the others",
+        265: "a bias that was replaced, and a copy of the weights that keeps the old one",
+        266: "a call on a model card that can't be made",
     },
 }
 

@@ -16,6 +16,7 @@ from fdtasil.errors import ExpertError, SettingError
 from fdtasil.experts.load import expert_in
 from fdtasil.experts.sb3.agent import read_agent
 from fdtasil.rollouts.environments import EnvironmentPool
+from fdtasil.student.plain import PlainPolicy
 
 pytestmark = pytest.mark.usefixtures("no_pictures")
 
@@ -280,3 +281,12 @@ def test_yes_and_no_of_an_agent():
         found = expert_in(agent, pool).ask(rows, "check")
         best = pool.spaces.actions.best(found)
     assert np.array_equal(best, agent.predict(rows, deterministic=True)[0])
+
+
+def test_the_copy_in_numpy_chooses_too(tmp_path):
+    result = distilled(scores)
+    plain, states = result.student.plain, result.demonstrations.observations[:5]
+    result.save(tmp_path / "run")
+    loaded = PlainPolicy.load(tmp_path / "run" / "student.safetensors")
+    assert plain.choices == loaded.choices != ()
+    assert np.array_equal(plain.choose(states), loaded.choose(states))

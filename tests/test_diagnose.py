@@ -454,3 +454,10 @@ def test_what_is_no_such_simulator_has_no_linearised_loop():
     )
     found = fdtasil.diagnose(lqr, lqr, scaled, episodes=2, horizon=20)
     assert found.linearisation is None
+    timed = gymnasium.wrappers.TimeAwareObservation(gymnasium.make("InvertedPendulum-v5"))
+    found = fdtasil.diagnose(early, early, timed, episodes=2, horizon=20)
+    assert found.linearisation is None
+
+
+def early(rows):
+    return lqr(rows[:, :4])

@@ -516,6 +516,23 @@ def test_a_loop_that_does_not_end(tmp_path, rows, impatient):
 
 
 @pytest.mark.fault(22)
+def test_a_loop_that_does_not_end_in_a_recurrent_model(tmp_path, impatient):
+    model, float32 = repeated(1e9), TensorProto.FLOAT
+    entry, leaving = (
+        helper.make_tensor_value_info(name, float32, [1, 1, 3]) for name in ("h_in", "h_out")
+    )
+    model.graph.input.append(entry)
+    model.graph.output.append(leaving)
+    model.graph.node.append(helper.make_node("Identity", ["h_in"], ["h_out"]))
+    expert = fdtasil.load_expert(bomb(tmp_path / "e.onnx", model), 5, 2)
+    assert expert.memory is not None
+    start = time.monotonic()
+    with pytest.raises(ExpertError, match=r"one call took more than 0\.4 s"):
+        expert.ask(np.ones((1, 8), np.float32), "act")
+    assert time.monotonic() - start < 10
+
+
+@pytest.mark.fault(22)
 def test_many_turns_in_time_are_no_fault(tmp_path, rows):
     path = bomb(tmp_path / "e.onnx", repeated(1e3))
     assert np.isfinite(fdtasil.load_expert(path, 5, 2).ask(rows, "act")).all()

@@ -9,6 +9,7 @@ from toy_forms import InForm, in_form
 
 import fdtasil
 from fdtasil.errors import EnvironmentFault, SettingError
+from fdtasil.rollouts.recording import HOLD
 
 pytestmark = pytest.mark.usefixtures("no_pictures")
 
@@ -127,3 +128,24 @@ def test_one_environment_for_two_is_refused(tmp_path):
     many = lambda: gymnasium.vector.SyncVectorEnv([Drawn])  # noqa: E731
     with pytest.raises(SettingError, match="vector"):
         fdtasil.render({"a": rest}, many, tmp_path / "f.gif", horizon=3)
+
+
+@pytest.mark.fault(262)
+def test_a_planner_without_an_answer_goes_on_as_before(tmp_path):
+    """For a while; NaN would become a black picture, or an action of its own."""
+    acted, known = [], set()
+
+    class Watched(Drawn):
+        def step(self, action):
+            acted.append(np.array(action))
+            return super().step(action)
+
+    def fails(rows):
+        if len(acted) < 3:
+            known.update(row.tobytes() for row in rows)
+        answers = [0.5 if row.tobytes() in known else np.nan for row in rows]
+        return np.repeat(np.float32(answers)[:, None], 2, axis=1)
+
+    fdtasil.render({"planner": fails}, Watched, tmp_path / "f.gif", horizon=30)
+    assert len(acted) == 3 + HOLD
+    assert np.array_equal(acted, np.full((len(acted), 2), 0.5))

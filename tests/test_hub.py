@@ -16,6 +16,7 @@ from shells import shell
 
 import fdtasil
 from fdtasil.errors import ExpertError, SettingError
+from fdtasil.experts.hub import requests, uri
 from fdtasil.experts.load import load_expert
 
 try:
@@ -547,3 +548,22 @@ def test_huggingface_hub_takes_the_stand_in_for_the_hub(large, hub, tmp_path):
     with open(path, "rb") as file:
         assert file.read() == (tmp_path / "walker.onnx").read_bytes()
     assert newest(hub) in path
+
+
+@pytest.mark.fault(259)
+def test_a_download_that_is_given_up_ends():
+    taken = []
+
+    def without_end():
+        while True:
+            taken.append(1)
+            time.sleep(0.001)
+            yield b"part"
+
+    parts = requests._patiently(without_end(), uri.parse(WALKER))
+    assert next(parts) == b"part"
+    parts.close()
+    time.sleep(0.1)
+    before = len(taken)
+    time.sleep(0.2)
+    assert len(taken) == before

@@ -2,12 +2,17 @@
 
 import os
 import signal
+import threading
+import time
+import types
+from concurrent.futures import CancelledError, ThreadPoolExecutor
 
 import numpy as np
 import pytest
 
 from fdtasil.errors import ExpertError, SettingError
 from fdtasil.experts.load import load_expert
+from fdtasil.experts.workers import on_ray
 
 GAIN = np.random.default_rng(0).standard_normal((2, 5)).astype(np.float32)
 ROWS = np.random.default_rng(1).standard_normal((60, 5)).astype(np.float32)
@@ -72,3 +77,50 @@ def test_what_an_expert_raises_there_is_told_here():
 
     with pytest.raises(ExpertError, match="lost 3 times with a batch of 8"):
         load_expert(lost, 5, 2, workers="ray:1").ask(ROWS[:8], "probe")
+
+
+@pytest.mark.fault(264)
+def test_an_actor_that_was_ended_is_not_begun_again():
+    """With a stand-in for ray: its actor waits until it is ended."""
+    said, ended = [], threading.Event()
+
+    class Lost(Exception):
+        pass
+
+    class Ray:
+        exceptions = types.SimpleNamespace(
+            GetTimeoutError=TimeoutError, RayTaskError=ZeroDivisionError, RayError=Lost
+        )
+
+        def remote(self, **_):
+            said.append("begun")
+            method = types.SimpleNamespace(remote=lambda *_: "reply")
+            handle = types.SimpleNamespace(opened=method, answer=method)
+            return lambda _: types.SimpleNamespace(remote=lambda _: handle)
+
+        def wait(self, opened, timeout):
+            return opened, []
+
+        def get(self, _, timeout=0.0):
+            if timeout is None:
+                said.append("asked")
+                ended.wait(10)
+                raise Lost
+            return True
+
+        def is_initialized(self):
+            return True
+
+        def kill(self, _):
+            said.append("ended")
+            ended.set()
+
+    actor = on_ray._Actor(Ray(), "the expert", b"", None)
+    with ThreadPoolExecutor(1) as thread:
+        answer = thread.submit(actor.answer, ROWS)
+        while "asked" not in said:
+            time.sleep(0.01)
+        actor.stop()
+        with pytest.raises(CancelledError):
+            answer.result(10)
+    assert said == ["begun", "asked", "ended"]

@@ -62,10 +62,20 @@ def test_the_command_and_the_card_of_a_folder(quick_folder, inside, tmp_path):
     assert "## How good" in card
 
 
-@pytest.mark.parametrize("further", [{}, {"history": 2}], ids=str)
+@pytest.mark.fault(266)
+@pytest.mark.parametrize(
+    "further",
+    [
+        {},
+        {"history": 2},
+        {"spread": {4: 0.5}},
+        {"trainer": fdtasil.DAgger(beta=0.25), "episodes": 3},
+    ],
+    ids=str,
+)
 def test_the_call_of_the_card_repeats_the_run(further, linear):
     """With an expert of its own: a function has no path."""
-    result = fdtasil.distill(linear, TOY, 3, **QUICK, **further)
+    result = fdtasil.distill(linear, TOY, 3, **(QUICK | further))
     block = re.search(r"```python\n(.*?)```", card_of(result), re.S)[1]
     assert "expert = ...  # the function <lambda>\n" in block
     code = re.sub(r"(?m)^expert = .*$", "", block).replace(repr(result.settings["env"]), "env")

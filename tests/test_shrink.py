@@ -119,6 +119,7 @@ def test_micro():
         fdtasil.distill(law, TOY, 2, **{**QUICK, "student": "macro"})
 
 
+@pytest.mark.fault(257)
 def test_another_call_in_the_same_folder_is_refused(run, tmp_path):
     options = {**FAST, "fit": fdtasil.Fit(steps=5), "cloned": False, "keep": 0.0}
     fdtasil.shrink(run, law, TOY, **options, out=tmp_path / "s")
@@ -130,6 +131,7 @@ def test_another_call_in_the_same_folder_is_refused(run, tmp_path):
         )
 
 
+@pytest.mark.fault(257)
 def test_a_killed_one_goes_on(run, tmp_path, monkeypatch):
     """Within a student's training, and to the same bytes."""
     options = {**FAST, "fit": fdtasil.Fit(steps=300), "cloned": False, "keep": 0.0}

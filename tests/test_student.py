@@ -222,3 +222,12 @@ def test_what_eight_bits_can_not_hold_is_refused():
     rows = 50 * np.random.default_rng(0).standard_normal((200, 3)).astype(np.float32)
     with pytest.raises(ExportError, match="in int8"):
         export(student, rows, {}, "student.int8.onnx")
+
+
+@pytest.mark.fault(265)
+def test_the_copy_in_numpy_follows_every_weight():
+    student, rows = make(), np.zeros((2, 3), np.float32)
+    student.predict(rows[0])
+    with torch.no_grad():
+        student.network[-1].bias = torch.nn.Parameter(student.network[-1].bias + 1)
+    assert student.predict(rows[0])[0] == pytest.approx(student.predict(rows)[0][0], abs=1e-5)

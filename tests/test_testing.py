@@ -7,6 +7,7 @@ from conftest import GAIN, TOY
 from test_gate import FAULTS
 
 from fdtasil.errors import ExpertError
+from fdtasil.rollouts.behaviours import farthest_apart
 from fdtasil.testing import check_expert, check_student
 
 NAMES = ["opening", "answers", "determinism", "batch independence", "large batches"]
@@ -67,3 +68,22 @@ def test_a_student_without_bounds_is_found_far_out():
     with torch.no_grad():
         layer.weight.copy_(torch.from_numpy(GAIN))
     assert list(problems(check_student(layer, TOY))) == ["far states"]
+
+
+@pytest.mark.fault(263)
+def test_a_row_without_an_answer_hides_no_fault_of_the_others(linear):
+    def planner(rows):
+        answers = linear(rows) + 1e-2 * len(rows)
+        answers[rows[:, 0] > np.float32(0.9)] = np.nan
+        return answers
+
+    def silent_and_fair(rows):
+        answers = linear(rows)
+        answers[rows[:, 0] > np.float32(0.9)] = np.nan
+        return answers
+
+    assert "batch sizes" in problems(check_expert(planner, TOY))
+    assert "batch sizes" not in problems(check_expert(silent_and_fair, TOY))
+    some, none = np.float32([[1, 2], [3, 4]]), np.float32([[1, np.nan], [3, 6]])
+    assert farthest_apart(some, none) == farthest_apart(none, some) == 2
+    assert farthest_apart(none[:1], some[:1]) == 0

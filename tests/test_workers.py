@@ -2,6 +2,7 @@
 
 import ctypes
 import gc
+import io
 import os
 import signal
 import subprocess
@@ -18,6 +19,7 @@ from conftest import GAIN, QUICK, TOY, mlp_onnx
 
 import fdtasil
 from fdtasil.errors import ExpertError, SettingError
+from fdtasil.experts import worker_process
 
 
 @pytest.fixture
@@ -408,3 +410,12 @@ def test_ctrl_c_shows_one_traceback_and_leaves_no_worker(script):
     assert process.returncode == -signal.SIGINT
     assert error.count("Traceback") == error.count("KeyboardInterrupt") == 1
     assert gone(pids)
+
+
+@pytest.mark.fault(258)
+def test_a_message_that_is_cut_short_is_an_end():
+    whole = io.BytesIO()
+    worker_process.send(whole, list(range(1000)))
+    for length in (0, 5, 8, 9, len(whole.getvalue()) - 1):
+        with pytest.raises(EOFError):
+            worker_process.receive(io.BytesIO(whole.getvalue()[:length]))

@@ -71,9 +71,7 @@ def _dataset_of(source: "str | minari.MinariDataset", minari: Any) -> Dataset:
     ]
     if not episodes:
         raise StorageError(f"{source!r} has no episodes", "at least one", "choose another dataset")
-    states = episodes[0]
-    for episode in episodes[1:]:
-        states = states + episode
+    states = Demonstrations.joined(episodes)
     ends = bounds_of(data.action_space, spaces.actions)
     low, high = (np.asarray(unbounded(bound), np.float32) for bound in ends)
     name = data.env_spec.id if data.env_spec else data.spec.dataset_id

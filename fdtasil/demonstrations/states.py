@@ -1,5 +1,6 @@
 """Demonstrations: visited states, each with the expert's action."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -47,9 +48,14 @@ class Demonstrations:
         """Return some of the states, given by (N,) bool or by numbers."""
         return Demonstrations(*(part[rows] for part in vars(self).values()))
 
+    @staticmethod
+    def joined(parts: "Sequence[Demonstrations]") -> "Demonstrations":
+        """Return the states of all parts, of which there is at least one."""
+        fields = zip(*(vars(part).values() for part in parts), strict=True)
+        return Demonstrations(*map(np.concatenate, fields))
+
     def __add__(self, other: "Demonstrations") -> "Demonstrations":
-        pairs = zip(vars(self).values(), vars(other).values(), strict=True)
-        return Demonstrations(*(np.concatenate(pair) for pair in pairs))
+        return Demonstrations.joined([self, other])
 
 
 def label(episodes: Episodes, expert: Expert, first_episode: int, round_: int) -> Demonstrations:

@@ -320,7 +320,7 @@ def describe_trainer(trainer: Trainer) -> str:
     fields = vars(trainer).items()
     usual = vars(TRAINERS[trainer.name]()) if trainer.name in TRAINERS else {}
     odd = [
-        f"{name}={getattr(value, '__name__', value)}"
+        f"{name}={getattr(value, '__name__', repr(value))}"
         for name, value in fields
         if usual.get(name) != value
     ]

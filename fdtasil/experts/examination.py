@@ -12,7 +12,7 @@ from fdtasil.experts.expert import Expert
 from fdtasil.experts.gate import GATE_STATES, Finding, admit_expert, examine_expert
 from fdtasil.experts.load import ExpertLike, expert_in
 from fdtasil.progress import Progress
-from fdtasil.rollouts.behaviours import follow_answers, random_behaviour
+from fdtasil.rollouts.behaviours import farthest_apart, follow_answers, random_behaviour
 from fdtasil.rollouts.environments import EnvironmentPool, resolve_horizon
 from fdtasil.rollouts.episodes import Episodes, check_episodes
 from fdtasil.rollouts.rollout import first_observations, rollout
@@ -173,8 +173,8 @@ def _batch_sizes(expert: Expert, states: np.ndarray) -> Finding:
         parts = {count: expert.ask(rows[:count], "check") for count in counts}
     except ExpertError as error:
         return Finding(name, error.found, error)
-    bound = _SAME * max(1.0, float(np.abs(whole).max()))
-    wrong = [n for n, part in parts.items() if np.abs(part - whole[:n]).max() > bound]
+    bound = _SAME * max(1.0, float(np.nan_to_num(np.abs(whole)).max()))
+    wrong = [n for n, part in parts.items() if farthest_apart(part, whole[:n]) > bound]
     if not wrong:
         return Finding(name, f"the same answers in batches of {_listed(counts)} rows", None)
     found = f"{expert.name} answers otherwise in batches of {_listed(wrong)} rows"

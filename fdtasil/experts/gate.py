@@ -9,7 +9,7 @@ import numpy as np
 from fdtasil.errors import ExpertError, FdtasilError, warn
 from fdtasil.experts.expert import Expert
 from fdtasil.experts.silence import check_answered
-from fdtasil.rollouts.behaviours import has_none
+from fdtasil.rollouts.behaviours import farthest_apart, has_none
 from fdtasil.rollouts.environments import Boxes
 
 __all__ = [
@@ -218,7 +218,7 @@ class _Answers:
     boxes: Boxes
 
     def same(self, other: np.ndarray, name: str, how: str, advice: tuple[str, str]) -> Finding:
-        difference = float(np.abs(self.answers - other).max())
+        difference = farthest_apart(self.answers, other)
         measured = f"{how}: largest difference {difference:.1e}"
         if difference <= _SAME * self._range():
             return Finding(name, measured, None)

@@ -19,6 +19,7 @@ from fdtasil.experts.trial import try_out
 from fdtasil.experts.twin import torch_twin
 from fdtasil.files.onnx.binding import bind
 from fdtasil.files.onnx.model import read_model
+from fdtasil.files.onnx.nodes import free_inputs
 from fdtasil.files.onnx.policy import (
     OnnxPolicy,
     cannot_be_asked,
@@ -173,8 +174,7 @@ def _natural_inputs(
     An input that has the name of a part of the observation is given that part, and the only one
     is given all of it where it takes a stack of frames.
     """
-    constants = {tensor.name for tensor in model.graph.initializer}
-    entries = [entry for entry in model.graph.input if entry.name not in constants]
+    entries = list(free_inputs(model.graph).values())
     if len(entries) == 1:
         sizes = [d.dim_value for d in entries[0].type.tensor_type.shape.dim][1:]
         stacked = len(sizes) > 1 and all(size > 0 for size in sizes)
@@ -189,8 +189,7 @@ def _natural_inputs(
 
 def _declared_size(model: "onnx.ModelProto") -> int:
     """Return n as the only input says it; 0 where it leaves it open, or there are several."""
-    constants = {tensor.name for tensor in model.graph.initializer}
-    inputs = [entry for entry in model.graph.input if entry.name not in constants]
+    inputs = list(free_inputs(model.graph).values())
     dimensions = inputs[0].type.tensor_type.shape.dim if len(inputs) == 1 else []
     return max(0, dimensions[-1].dim_value) if dimensions else 0
 

@@ -7,6 +7,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from fdtasil.files.onnx.nodes import free_inputs
+
 if TYPE_CHECKING:
     import onnx
 
@@ -64,7 +66,7 @@ class _Twin(torch.nn.Module):
         self._constants: dict[str, str] = {}  # by name in the graph, of buffers: they go along
         for tensor in graph.initializer:
             self._keep(tensor.name, tensor)
-        self._input, self._output = graph.input[0].name, output
+        (self._input,), self._output = free_inputs(graph), output
         self._nodes: list[tuple[str, list[str], str, dict[str, Any]]] = []
         for node in _needed(graph, output):
             attributes = {a.name: onnx.helper.get_attribute_value(a) for a in node.attribute}

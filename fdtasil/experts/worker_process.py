@@ -37,9 +37,10 @@ def receive(stream: IO[bytes]) -> bytes:
     Raises:
         EOFError: If the other side is gone.
     """
-    length = stream.read(_LENGTH.size)
-    data = stream.read(_LENGTH.unpack(length)[0]) if len(length) == _LENGTH.size else b""
-    if not data:
+    head = stream.read(_LENGTH.size)
+    length = _LENGTH.unpack(head)[0] if len(head) == _LENGTH.size else 0
+    data = stream.read(length)
+    if not length or len(data) < length:  # it may end in the middle of a message
         raise EOFError
     return data
 

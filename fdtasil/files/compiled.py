@@ -57,7 +57,8 @@ def shared_function(source: str, name: str) -> Callable[[int, int], None]:
     found = compiler()
     if found is None:
         raise ExportError("no C compiler", "cc, gcc or clang", "install one, such as gcc")
-    with tempfile.TemporaryDirectory() as folder:  # what is loaded stays when the file goes
+    # What is loaded stays when the file goes; Windows keeps the file, too.
+    with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         file, library = Path(folder) / "policy.c", Path(folder) / "policy.so"
         file.write_text(source)
         command = [found, "-std=c99", "-O2", "-shared", "-fPIC", "-o", str(library), str(file)]

@@ -78,14 +78,14 @@ def linearise(
     for seed in seeds:
         seen, _ = env.reset(seed=int(seed), **pool.reset_options)
         for step in range(max(steps) + 1):
-            if not np.allclose(_observed(simulator), np.ravel(seen), atol=1e-5):
+            if not _same(_observed(simulator), np.ravel(seen), 1e-5):
                 return None
             if step in steps:
                 size_of = partial(_largest, simulator, pool.bounds)
                 found.append((step, size_of(expert), size_of(student)))
             action = _acted(expert, seen, pool.bounds)
             seen, _, terminated, truncated, _ = env.step(action)
-            if not np.allclose(simulator.data.ctrl, action, atol=1e-6):
+            if not _same(simulator.data.ctrl, action, 1e-6):
                 return None
             if terminated or truncated:
                 break
@@ -99,6 +99,10 @@ def _is_mujoco(simulator: Any, actions: int) -> bool:
     """Whether it is a simulation whose actions are its controls."""
     names = ("model", "data", "frame_skip", "_get_obs")
     return all(hasattr(simulator, name) for name in names) and simulator.model.nu == actions
+
+
+def _same(ours: np.ndarray, theirs: np.ndarray, tolerance: float) -> bool:
+    return ours.shape == theirs.shape and np.allclose(ours, theirs, atol=tolerance)
 
 
 def _acted(policy: Policy, seen: Any, bounds: OwnBounds) -> np.ndarray:

@@ -66,8 +66,10 @@ def result_html(result: Any) -> str:
 
 
 def _headline(evaluation: Evaluation | None) -> str:
-    if evaluation is None or evaluation.normalized_return is None:
+    if evaluation is None:
         return "<p>It was not compared with its expert.</p>"
+    if evaluation.normalized_return is None:
+        return "<p>A share of its expert's return means nothing here.</p>"
     share = f"{evaluation.normalized_return:.0%}"
     return f'<p><span class="big">{share}</span> of the expert\'s return</p>'
 

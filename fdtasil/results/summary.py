@@ -6,6 +6,7 @@ from typing import Any
 
 import gymnasium
 
+from fdtasil.demonstrations.trainers import TRAINERS
 from fdtasil.errors import in_one_line, shown
 from fdtasil.experts.expert import rows_text
 from fdtasil.experts.http_expert import is_http_url
@@ -61,17 +62,19 @@ def call_of(settings: Mapping[str, Any], history: int) -> str:
     given.append("0" if probes == "none" else repr(probes))
     recorded = () if data else ("trainer", "episodes")
     told = (*recorded, "horizon", "seed") if env else (*recorded, "seed")
-    plain = {name: settings.get(name) for name in told}
+    plain = {name: repr(settings[name]) for name in told if settings.get(name) is not None}
+    if "trainer" in plain:
+        plain["trainer"] = _trainer(settings["trainer"])
     if data:
         given.append("dataset=dataset")
-    given += [f"{name}={value!r}" for name, value in plain.items() if value is not None]
+    given += [f"{name}={value}" for name, value in plain.items()]
     seen = settings.get("student_obs")
     if seen is not None:
         given.append(f"student_obs={seen!r}" if not isinstance(seen, str) else f"...  # {seen}")
     if settings.get("keep") not in (None, "all"):
         given.append(f"keep={settings['keep']!r}")
     if settings.get("spread"):
-        given.append(f"spread={settings['spread']!r}")
+        given.append(f"spread={_spread(settings['spread'])!r}")
     if history > 1:
         given.append(f"history={history}")
     given.append(f"evaluation_episodes={settings['evaluation_episodes']}")
@@ -87,6 +90,22 @@ def call_of(settings: Mapping[str, Any], history: int) -> str:
     made = [f"{name} = ...  # {in_one_line(said)}\n" for name, said in lost.items()]
     first = "".join([*made, "\n"]) if made else ""
     return f"import fdtasil\n\n{first}result = fdtasil.distill(\n{inside},\n)\n"
+
+
+def _trainer(described: str) -> str:
+    """Return the code of a trainer; its name, where it has the usual settings."""
+    name, odd, settings = described.partition(",")
+    if not odd or name not in TRAINERS:
+        return repr(described)
+    made_by = getattr(TRAINERS[name], "__name__", name)
+    return f"fdtasil.{made_by}({settings})"
+
+
+def _spread(written: Mapping[str, Any]) -> dict[int, float] | str:
+    """Return the argument `spread` as it was given, of what JSON made of it."""
+    if "bounds" in written:
+        return "bounds"
+    return {int(column): deviation for column, deviation in written.items()}
 
 
 def _environment(settings: Mapping[str, Any]) -> str | None:

@@ -11,6 +11,7 @@ __all__ = [
     "Behaviour",
     "Decision",
     "Policy",
+    "farthest_apart",
     "follow",
     "follow_answers",
     "has_none",
@@ -66,6 +67,12 @@ def silent_rows(answers: np.ndarray) -> np.ndarray | None:
 def has_none(answers: np.ndarray) -> np.ndarray:
     """Return (B,) bool, the rows of (B, m) answers that are none."""
     return np.asarray(np.isnan(answers).any(axis=1))
+
+
+def farthest_apart(ours: np.ndarray, theirs: np.ndarray) -> float:
+    """Return the largest difference of (B, m) answers, where both are some; else 0."""
+    both = ~(has_none(ours) | has_none(theirs))
+    return float(np.abs(ours[both] - theirs[both]).max(initial=0.0))
 
 
 def random_behaviour(pool: EnvironmentPool) -> Behaviour:

@@ -11,7 +11,7 @@ from fdtasil.demonstrations.trainers import Situation, Trainer
 from fdtasil.errors import SettingError
 from fdtasil.experts.expert import Expert
 from fdtasil.progress import Progress
-from fdtasil.rollouts.behaviours import Behaviour, Policy
+from fdtasil.rollouts.behaviours import Behaviour, Policy, farthest_apart
 from fdtasil.rollouts.environments import EnvironmentPool
 from fdtasil.rollouts.episodes import Episodes, check_episodes
 from fdtasil.rollouts.rollout import rollout
@@ -108,7 +108,7 @@ class Collecting:
         bound = _SAME * float(np.abs(states.actions).max())
         if (apart <= bound).all():
             return
-        if np.abs(self.expert.ask(rows, "check") - answers).max() > bound:
+        if farthest_apart(self.expert.ask(rows, "check"), answers) > bound:
             return  # one that does not repeat itself either was let through the gate
         worst = int(apart.argmax())
         raise SettingError(

@@ -20,8 +20,10 @@ from fdtasil.experts.load import ExpertLike, sized
 from fdtasil.experts.onnx_expert import said_history
 from fdtasil.files.storage import write_bytes
 from fdtasil.progress import Progress
+from fdtasil.rollouts.behaviours import has_none
 from fdtasil.rollouts.environments import EnvironmentLike, EnvironmentPool, resolve_horizon
 from fdtasil.rollouts.history import WithHistory
+from fdtasil.rollouts.recording import HOLD
 from fdtasil.rollouts.wanted import Environment
 from fdtasil.run.judging import judged_in
 from fdtasil.student.view import View
@@ -108,6 +110,8 @@ class _Player:
 
     def __init__(self, name: str, policy: ExpertLike, env: EnvironmentLike, seed: int) -> None:
         self.name, self.seed, self.total, self.step, self.over = str(name), seed, 0.0, 0, False
+        self._last: np.ndarray | None = None
+        self._silent = 0  # steps without an answer
         self.pool = EnvironmentPool(_drawing(env))
         try:
             if self.pool.together is not None:
@@ -138,11 +142,20 @@ class _Player:
         return self._env.unwrapped
 
     def move(self) -> None:
-        """Take a step; an episode that is over stands still."""
+        """Take a step; an episode that is over stands still, and one without an answer goes on."""
         if self.over:
             return
-        rows = self._seen[None].astype(np.float32)
-        action = self.pool.bounds.put_inside(self._act(rows))[0][0]
+        answer = self._act(self._seen[None].astype(np.float32))
+        none = bool(has_none(answer)[0])
+        self._silent = self._silent + 1 if none else 0
+        if self._silent > HOLD:
+            self.over = True
+            return
+        if not none:
+            self._last = answer
+        # At the start there is no last action: the one nearest to none.
+        acted = np.zeros_like(answer) if self._last is None else self._last
+        action = self.pool.bounds.put_inside(acted)[0][0]
         self._seen, reward, terminated, truncated, _ = self._env.step(action)
         self.total, self.step = self.total + float(reward), self.step + 1
         self.over = bool(terminated or truncated)

@@ -1,10 +1,11 @@
 """A student's ONNX file in the environment's own form: choices go out, and one input a part in."""
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from fdtasil.errors import ExportError
+from fdtasil.files.onnx.nodes import Nodes
 from fdtasil.files.onnx.session import open_session
 from fdtasil.rollouts.spaces import Layout, Part, Spaces
 from fdtasil.student.policy import Student
@@ -30,7 +31,7 @@ def _with_choices(model: "onnx.ModelProto", actions: Layout) -> "onnx.ModelProto
     """
     from onnx import TensorProto, helper
 
-    nodes = _Nodes("choice")
+    nodes = Nodes("fdtasil.choice_")
     for node in model.graph.node:
         node.output[:] = ["scores" if name == _ANSWER else name for name in node.output]
         node.input[:] = ["scores" if name == _ANSWER else name for name in node.input]
@@ -38,13 +39,14 @@ def _with_choices(model: "onnx.ModelProto", actions: Layout) -> "onnx.ModelProto
     best = []
     for (start, end), offset in zip(actions.choices, first, strict=True):
         ends = [nodes.integers([value]) for value in (start, end, 1)]
-        mine = nodes.add("Slice", "scores", *ends)
-        chosen = nodes.add("ArgMax", mine, axis=1, keepdims=1)
-        best.append(nodes.add("Add", chosen, nodes.integers([offset])))
-    joined = nodes.add("Concat", *best, axis=1)
+        mine = nodes.node("Slice", "scores", *ends)
+        chosen = nodes.node("ArgMax", mine, axis=1, keepdims=1)
+        best.append(nodes.node("Add", chosen, nodes.integers([offset])))
+    joined = nodes.node("Concat", *best, axis=1)
     single = len(actions.parts) == 1 and not actions.parts[0].shape
-    last = nodes.add("Squeeze", joined, nodes.integers([1])) if single else joined
-    nodes.last_is(last, _ANSWER)
+    if single:
+        nodes.node("Squeeze", joined, nodes.integers([1]))
+    nodes.name_last(_ANSWER)
     nodes.put_behind(model)
     (scores,) = model.graph.output
     scores.name = "scores"
@@ -62,16 +64,10 @@ def _with_keys(model: "onnx.ModelProto", observations: Layout) -> "onnx.ModelPro
         observations: Of the environment.
 
     Raises:
-        ExportError: If the parts have no names.
+        ExportError: If one is called as an output is.
     """
     from onnx import TensorProto, helper
 
-    if len(observations.names) < len(observations.parts):
-        raise ExportError(
-            'inputs="keys" of observations that have none',
-            "a student of a dictionary or a tuple of observations",
-            'leave inputs= out: the file takes one input, "obs"',
-        )
     taken = {entry.name for entry in model.graph.output} & set(observations.names)
     if taken:
         raise ExportError(
@@ -79,13 +75,14 @@ def _with_keys(model: "onnx.ModelProto", observations: Layout) -> "onnx.ModelPro
             "another name",
             'leave inputs= out: the file takes one input, "obs"',
         )
-    nodes, columns, inputs = _Nodes("key"), [], []
+    nodes, columns, inputs = Nodes("fdtasil.key_"), [], []
     for part in observations.parts:
         whole = part.kind in ("choice", "whole")
         kind = TensorProto.INT64 if whole else TensorProto.FLOAT
         inputs.append(helper.make_tensor_value_info(part.name, kind, ["batch", *part.shape]))
         columns.append(_flat(nodes, part, whole))
-    nodes.last_is(nodes.add("Concat", *columns, axis=1), _FLAT)
+    nodes.node("Concat", *columns, axis=1)
+    nodes.name_last(_FLAT)
     nodes.put_before(model)
     del model.graph.input[:]
     model.graph.input.extend(inputs)
@@ -93,8 +90,15 @@ def _with_keys(model: "onnx.ModelProto", observations: Layout) -> "onnx.ModelPro
 
 
 def own_form(model: "onnx.ModelProto", spaces: Spaces | None, *, keys: bool) -> "onnx.ModelProto":
-    """Return a student's model with what its environment's spaces ask for."""
-    _prefix(model)
+    """Return a student's model with what its environment's spaces ask for.
+
+    Raises:
+        ExportError: If the parts of the observations have no names, where they are asked for.
+    """
+    from onnx.compose import add_prefix_graph
+
+    # What is inside has names that no part of an observation has.
+    model.graph.CopyFrom(add_prefix_graph(model.graph, "fdtasil.", rename_outputs=False))
     if spaces is not None and spaces.actions.choices:
         model = _with_choices(model, spaces.actions)
     if not keys:
@@ -102,8 +106,12 @@ def own_form(model: "onnx.ModelProto", spaces: Spaces | None, *, keys: bool) -> 
         for node in model.graph.node:
             node.input[:] = ["obs" if name == _FLAT else name for name in node.input]
         return model
-    if spaces is None:
-        return _with_keys(model, Layout((Part((), "number", (1,), "float32"),)))
+    if spaces is None or len(spaces.observations.names) < len(spaces.observations.parts):
+        raise ExportError(
+            'inputs="keys" of observations that have none',
+            "a student of a dictionary or a tuple of observations",
+            'leave inputs= out: the file takes one input, "obs"',
+        )
     return _with_keys(model, spaces.observations)
 
 
@@ -151,80 +159,19 @@ def check_own_form(
 _NEAR = 1e-4
 
 
-def _prefix(model: "onnx.ModelProto") -> None:
-    """Give what is inside names that no part of an observation has."""
-    ends = {_ANSWER}
-
-    def renamed(name: str) -> str:
-        return name if name in ends else f"fdtasil.{name}"
-
-    for node in model.graph.node:
-        node.input[:] = [renamed(name) for name in node.input]
-        node.output[:] = [renamed(name) for name in node.output]
-        node.name = renamed(node.name)
-    for tensor in model.graph.initializer:
-        tensor.name = renamed(tensor.name)
-    for entry in model.graph.input:
-        entry.name = renamed(entry.name)
-
-
-def _flat(nodes: "_Nodes", part: Part, whole: bool) -> str:
+def _flat(nodes: Nodes, part: Part, whole: bool) -> str:
     from onnx import TensorProto
 
     if part.kind != "choice":
-        given = nodes.add("Cast", part.name, to=TensorProto.FLOAT) if whole else part.name
-        return nodes.add("Reshape", given, nodes.integers([0, part.size]))
-    entries = nodes.add("Reshape", part.name, nodes.integers([-1, len(part.sizes)]))
+        given = nodes.node("Cast", part.name, to=TensorProto.FLOAT) if whole else part.name
+        return nodes.node("Reshape", given, nodes.integers([0, part.size]))
+    entries = nodes.node("Reshape", part.name, nodes.integers([-1, len(part.sizes)]))
     hot = []
     for entry, (size, first) in enumerate(zip(part.sizes, part.first, strict=True)):
         ends = [nodes.integers([value]) for value in (entry, entry + 1, 1)]
-        mine = nodes.add("Sub", nodes.add("Slice", entries, *ends), nodes.integers([first]))
-        row = nodes.add("Squeeze", mine, nodes.integers([1]))
+        mine = nodes.node("Sub", nodes.node("Slice", entries, *ends), nodes.integers([first]))
+        row = nodes.node("Squeeze", mine, nodes.integers([1]))
         hot.append(
-            nodes.add("OneHot", row, nodes.integers([size]), nodes.floats([0.0, 1.0]), axis=1)
+            nodes.node("OneHot", row, nodes.integers([size]), nodes.constant([0.0, 1.0]), axis=1)
         )
-    return nodes.add("Concat", *hot, axis=1)
-
-
-class _Nodes:
-    """Nodes and constants with names of their own."""
-
-    def __init__(self, prefix: str) -> None:
-        self.nodes: list[onnx.NodeProto] = []
-        self.constants: list[onnx.TensorProto] = []
-        self._prefix = prefix
-
-    def add(self, operator: str, *values: str, **attributes: Any) -> str:
-        from onnx import helper
-
-        name = f"fdtasil.{self._prefix}_{len(self.nodes)}"
-        self.nodes.append(helper.make_node(operator, values, [name], name, **attributes))
-        return name
-
-    def integers(self, values: list[int]) -> str:
-        return self._constant(np.array(values, np.int64))
-
-    def floats(self, values: list[float]) -> str:
-        return self._constant(np.array(values, np.float32))
-
-    def last_is(self, value: str, name: str) -> None:
-        """Name the value of the last node."""
-        assert self.nodes[-1].output[0] == value
-        self.nodes[-1].output[0] = name
-
-    def put_before(self, model: "onnx.ModelProto") -> None:
-        kept = list(model.graph.node)
-        del model.graph.node[:]
-        model.graph.node.extend([*self.nodes, *kept])
-        model.graph.initializer.extend(self.constants)
-
-    def put_behind(self, model: "onnx.ModelProto") -> None:
-        model.graph.node.extend(self.nodes)
-        model.graph.initializer.extend(self.constants)
-
-    def _constant(self, value: np.ndarray) -> str:
-        from onnx import numpy_helper
-
-        name = f"fdtasil.{self._prefix}_constant_{len(self.constants)}"
-        self.constants.append(numpy_helper.from_array(value, name))
-        return name
+    return nodes.node("Concat", *hot, axis=1)

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-__all__ = ["PLAIN", "PlainPolicy"]
+__all__ = ["PLAIN", "PlainPolicy", "choices_of"]
 
 
 def _gelu(x: np.ndarray) -> np.ndarray:
@@ -112,7 +112,7 @@ class PlainPolicy:
             raise ValueError(f"the activation {bend!r}, where one of {', '.join(PLAIN)} is known")
         parts = about.get("spaces", {}).get("actions", [])
         plain = tensors["mean"], tensors["scale"], layers, bend, bounded, centre, half
-        return cls(*plain, _choices(parts))
+        return cls(*plain, choices_of(parts))
 
     def choose(self, observation: np.ndarray) -> np.ndarray:
         """(n,) or (B, n) raw observations -> (c,) or (B, c), the best of each choice."""
@@ -157,7 +157,7 @@ def _safetensors(data: bytes) -> tuple[dict[str, np.ndarray], dict]:
         raise ValueError(f"not the weights of a student: {type(error).__name__}") from error
 
 
-def _choices(parts: Sequence[dict]) -> list[tuple[int, int, int]]:
+def choices_of(parts: Sequence[dict]) -> list[tuple[int, int, int]]:
     """Return start, end and first value of each choice of an action's parts."""
     found, start = [], 0
     for part in parts:

@@ -11,12 +11,13 @@ from torch import Tensor, nn
 from fdtasil.compute import ask_module
 from fdtasil.errors import SettingError
 from fdtasil.files.border import reads
-from fdtasil.files.onnx.graph import Graph
+from fdtasil.files.onnx.graph import add_module
+from fdtasil.files.onnx.nodes import Nodes
 from fdtasil.files.tensors import tensors_from_bytes, tensors_to_bytes
 from fdtasil.probes.scales import Scales
 from fdtasil.rollouts.spaces import Mismatch, Spaces
 from fdtasil.student.architectures import Architecture, Mlp, architecture_of, describe
-from fdtasil.student.plain import PlainPolicy
+from fdtasil.student.plain import PlainPolicy, choices_of
 
 __all__ = ["Student"]
 
@@ -98,20 +99,22 @@ class Student(nn.Module):
             squashed = torch.where(self._bounded, squashed, raw)
         return self._centre + self._half * squashed
 
-    def write_onnx(self, graph: Graph, value: str) -> str:
+    def write_onnx(self, nodes: Nodes, value: str) -> str:
         """Add the nodes of the student to an ONNX graph; see `Writable`."""
-        centred = graph.node("Sub", value, graph.constant(self.mean))
-        raw = graph.module(self.network, graph.node("Div", centred, graph.constant(self.scale)))
-        actions = graph.node("Tanh", raw) if self._bounded.any() else raw
+        centred = nodes.node("Sub", value, nodes.constant(self.mean))
+        raw = add_module(
+            nodes, self.network, nodes.node("Div", centred, nodes.constant(self.scale))
+        )
+        actions = nodes.node("Tanh", raw) if self._bounded.any() else raw
         if self._bounded.any() and not self._all_bounded:
             shares = self._bounded.float(), 1 - self._bounded.float()
             parts = zip((actions, raw), shares, strict=True)
-            actions = graph.node(
-                "Add", *(graph.node("Mul", p, graph.constant(s)) for p, s in parts)
+            actions = nodes.node(
+                "Add", *(nodes.node("Mul", p, nodes.constant(s)) for p, s in parts)
             )
         for operator, constant, idle in (("Mul", self._half, 1), ("Add", self._centre, 0)):
             if (constant != idle).any():
-                actions = graph.node(operator, actions, graph.constant(constant))
+                actions = nodes.node(operator, actions, nodes.constant(constant))
         return actions
 
     @property
@@ -125,7 +128,8 @@ class Student(nn.Module):
         if not isinstance(self.network, nn.Sequential) or not isinstance(self.architecture, Mlp):
             return None
         linear = [layer for layer in self.network if type(layer) is nn.Linear]
-        key = [self.mean.data_ptr(), *(layer.weight.data_ptr() for layer in linear)]
+        weights = (one for layer in linear for one in (layer.weight, layer.bias))
+        key = [self.mean.data_ptr(), *(one.data_ptr() for one in weights)]
         if self._plain is None or self._plain[0] != key:
             self._plain = key, self._in_numpy(self.architecture.activation, linear)
         return self._plain[1]
@@ -142,6 +146,7 @@ class Student(nn.Module):
             self._bounded.numpy(),
             self._centre.numpy(),
             self._half.numpy(),
+            choices_of(self.spaces.to_json()["actions"]) if self.spaces else (),
         )
 
     def act(self, observations: np.ndarray) -> np.ndarray:

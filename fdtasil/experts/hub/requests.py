@@ -3,7 +3,8 @@
 import os
 import queue
 import threading
-from collections.abc import Iterator
+from collections.abc import Generator, Iterator
+from contextlib import closing
 from dataclasses import replace
 from typing import TYPE_CHECKING, TypeVar
 
@@ -53,48 +54,55 @@ def download(uri: HubUri) -> bytes:
             yield from response.iter_bytes()
 
     data = bytearray()
-    for part in _patiently(answers(), uri):
-        data += part
-        if len(data) > _SIZE_LIMIT:
-            raise ExpertError(
-                f"{uri} has more than {_SIZE_LIMIT:,} bytes",
-                "an ONNX file with its weights, or a stable-baselines3 zip",
-                "check that this is the right file",
-            )
+    with closing(_patiently(answers(), uri)) as parts:
+        for part in parts:
+            data += part
+            if len(data) > _SIZE_LIMIT:
+                raise ExpertError(
+                    f"{uri} has more than {_SIZE_LIMIT:,} bytes",
+                    "an ONNX file with its weights, or a stable-baselines3 zip",
+                    "check that this is the right file",
+                )
     return bytes(data)
 
 
-def _patiently(parts: Iterator[Part], uri: HubUri) -> Iterator[Part]:
+def _patiently(parts: Iterator[Part], uri: HubUri) -> Generator[Part, None, None]:
     """Yield the parts of an answer as they come, none later than the user's patience allows.
 
     They are waited for in a thread of their own, since a request's timeout holds for each address
     of a host and for each step on its own, and for the look-up of a name not at all. Left alone,
-    the thread ends with its one request, whose own timeout is longer.
+    the thread ends with the next part, or with its one request, whose own timeout is longer.
 
     Raises:
         ExpertError: What went wrong, for the user.
     """
     arrived: queue.SimpleQueue[tuple[Part | None, Exception | None]] = queue.SimpleQueue()
+    given_up = threading.Event()
 
     def wait_for_all() -> None:
         try:
             for part in parts:
+                if given_up.is_set():
+                    return
                 arrived.put((part, None))
             arrived.put((None, None))
         except Exception as error:
             arrived.put((None, error))
 
     threading.Thread(target=wait_for_all, daemon=True).start()
-    while True:
-        try:
-            part, error = arrived.get(timeout=patience())
-        except queue.Empty as nothing:
-            raise explain(nothing, uri) from None
-        if error is not None:
-            raise explain(error, uri) from error
-        if part is None:
-            return
-        yield part
+    try:
+        while True:
+            try:
+                part, error = arrived.get(timeout=patience())
+            except queue.Empty as nothing:
+                raise explain(nothing, uri) from None
+            if error is not None:
+                raise explain(error, uri) from error
+            if part is None:
+                return
+            yield part
+    finally:
+        given_up.set()
 
 
 def explain(error: Exception, uri: HubUri) -> ExpertError:

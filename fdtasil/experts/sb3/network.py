@@ -13,7 +13,7 @@ from fdtasil.errors import ExpertError, shown
 from fdtasil.experts.sb3.recipes import Recipe
 from fdtasil.experts.sb3.spaces import Bounds
 from fdtasil.experts.sb3.trust import TRUST
-from fdtasil.files.onnx.graph import Graph
+from fdtasil.files.onnx.nodes import Nodes
 
 __all__ = ["Clip", "MeanOfQuantiles", "Normalise", "Rescale", "build_network"]
 
@@ -55,13 +55,13 @@ class Normalise(nn.Module):
         normalised = (observations - self.mean - self.rest) / self.scale
         return normalised.clamp(-self.clip, self.clip)
 
-    def write_onnx(self, graph: Graph, value: str) -> str:
+    def write_onnx(self, nodes: Nodes, value: str) -> str:
         """Add its nodes to an ONNX graph; see `Writable`."""
         for shift in (self.mean, self.rest):
-            value = graph.node("Sub", value, graph.constant(shift))
-        normalised = graph.node("Div", value, graph.constant(self.scale))
-        low, high = graph.constant(-self.clip), graph.constant(self.clip)
-        return graph.node("Clip", normalised, low, high)
+            value = nodes.node("Sub", value, nodes.constant(shift))
+        normalised = nodes.node("Div", value, nodes.constant(self.scale))
+        low, high = nodes.constant(-self.clip), nodes.constant(self.clip)
+        return nodes.node("Clip", normalised, low, high)
 
 
 class _Bounded(nn.Module):
@@ -81,12 +81,12 @@ class Rescale(_Bounded):
         """(B, m) in -1..1 -> (B, m) in environment units."""
         return self.low + 0.5 * (squashed + 1.0) * (self.high - self.low)
 
-    def write_onnx(self, graph: Graph, value: str) -> str:
+    def write_onnx(self, nodes: Nodes, value: str) -> str:
         """Add its nodes to an ONNX graph; see `Writable`."""
-        shifted = graph.node("Add", value, graph.constant(1.0))
-        halved = graph.node("Mul", shifted, graph.constant(0.5))
-        scaled = graph.node("Mul", halved, graph.constant(self.high - self.low))
-        return graph.node("Add", scaled, graph.constant(self.low))
+        shifted = nodes.node("Add", value, nodes.constant(1.0))
+        halved = nodes.node("Mul", shifted, nodes.constant(0.5))
+        scaled = nodes.node("Mul", halved, nodes.constant(self.high - self.low))
+        return nodes.node("Add", scaled, nodes.constant(self.low))
 
 
 class Clip(_Bounded):
@@ -96,10 +96,10 @@ class Clip(_Bounded):
         """(B, m) -> (B, m), both in environment units."""
         return torch.minimum(torch.maximum(actions, self.low), self.high)
 
-    def write_onnx(self, graph: Graph, value: str) -> str:
+    def write_onnx(self, nodes: Nodes, value: str) -> str:
         """Add its nodes to an ONNX graph; see `Writable`."""
-        raised = graph.node("Max", value, graph.constant(self.low))
-        return graph.node("Min", raised, graph.constant(self.high))
+        raised = nodes.node("Max", value, nodes.constant(self.low))
+        return nodes.node("Min", raised, nodes.constant(self.high))
 
 
 class MeanOfQuantiles(nn.Module):
@@ -113,10 +113,10 @@ class MeanOfQuantiles(nn.Module):
         """(B, count * m) -> (B, m)."""
         return quantiles.unflatten(1, (self.count, -1)).mean(dim=1)
 
-    def write_onnx(self, graph: Graph, value: str) -> str:
+    def write_onnx(self, nodes: Nodes, value: str) -> str:
         """Add its nodes to an ONNX graph; see `Writable`."""
-        apart = graph.node("Reshape", value, graph.integers([0, self.count, -1]))
-        return graph.node("ReduceMean", apart, graph.integers([1]), keepdims=0)
+        apart = nodes.node("Reshape", value, nodes.integers([0, self.count, -1]))
+        return nodes.node("ReduceMean", apart, nodes.integers([1]), keepdims=0)
 
 
 def build_network(

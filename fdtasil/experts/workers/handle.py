@@ -19,6 +19,7 @@ from fdtasil.experts.expert import RaisedElsewhere
 __all__ = ["Ended", "WorkerProcess", "in_a_process"]
 
 _START_SECONDS = 60.0  # at least; a worker may have to import torch on a busy machine
+_KILLED = getattr(signal, "SIGKILL", signal.SIGTERM)  # Windows has none
 _LAST_SECONDS = 2.0  # between the end of a process's pipe and its own
 _ONE_THREAD = dict.fromkeys(
     (
@@ -130,7 +131,7 @@ class WorkerProcess:
                 f"an answer within timeout={self._timeout:g}",
                 "raise timeout=, write a smaller batch=, or see what it waits for",
             )
-        memory = process.returncode == -signal.SIGKILL  # which the kernel sends
+        memory = process.returncode == -_KILLED  # which the kernel sends
         return ExpertError(
             f"{self._title} {_ending(process.returncode)} {when}",
             "a worker that lives as long as it is asked",
@@ -215,7 +216,7 @@ def _kill(process: "subprocess.Popen[bytes]") -> None:
         return
     with suppress(ProcessLookupError):
         if hasattr(os, "killpg"):
-            os.killpg(process.pid, signal.SIGKILL)
+            os.killpg(process.pid, _KILLED)
         else:
             process.kill()
 

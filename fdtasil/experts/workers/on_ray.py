@@ -1,5 +1,6 @@
 """Slow experts, asked by the machines of a Ray cluster."""
 
+from concurrent.futures import CancelledError
 from dataclasses import replace
 from typing import Any
 
@@ -61,12 +62,18 @@ class _Actor:
     def __init__(self, ray: Any, title: str, parcel: bytes, timeout: float | None) -> None:
         self._ray, self._title, self._parcel, self._timeout = ray, title, parcel, timeout
         self._handle: Any = None
+        self._stopped = False
 
     def recover(self) -> None:
-        """Nothing is left of a batch that was given up: the actor was ended."""
+        """Begin anew: nothing is left of a batch that was given up, for its actor was ended."""
+        self._stopped = False
 
     def stop(self) -> None:
-        """End the actor, whatever it is busy with."""
+        """End the actor, whatever it is busy with, and begin no other; see `Asker`."""
+        self._stopped = True
+        self._end()
+
+    def _end(self) -> None:
         handle, self._handle = self._handle, None
         if handle is not None and self._ray.is_initialized():
             self._ray.kill(handle)
@@ -76,11 +83,10 @@ class _Actor:
         errors = self._ray.exceptions
         for left in reversed(range(_TRIES)):
             try:
-                if self._handle is None:
-                    self._handle = self._begun()
-                return self._ray.get(self._handle.answer.remote(rows), timeout=self._timeout)
+                handle = self._handle or self._begun()
+                return self._ray.get(handle.answer.remote(rows), timeout=self._timeout)
             except errors.GetTimeoutError:
-                self.stop()
+                self._end()
                 raise ExpertError(
                     f"{self._title} gave no answer to {len(rows)} observations within "
                     f"{self._timeout:g} s",
@@ -91,7 +97,9 @@ class _Actor:
                 cause = error.cause or error
                 raise RaisedElsewhere(type(cause).__name__, str(cause)) from error
             except errors.RayError as error:
-                self.stop()
+                self._end()
+                if self._stopped:  # it was ended, and not lost
+                    raise CancelledError from error
                 if not left:
                     raise ExpertError(
                         f"{self._title} was lost {_TRIES} times with a batch of {len(rows)}: "
@@ -102,8 +110,11 @@ class _Actor:
         raise AssertionError("the last try returns or raises")
 
     def _begun(self) -> Any:
-        """Return an actor that has opened the expert."""
-        handle = self._ray.remote(num_cpus=1)(_Copy).remote(self._parcel)
+        """Begin an actor, and return it when it has opened the expert."""
+        self._handle = handle = self._ray.remote(num_cpus=1)(_Copy).remote(self._parcel)
+        if self._stopped:  # in this order no stop is lost: either it sees the actor, or we see it
+            self._end()
+            raise CancelledError
         opened = handle.opened.remote()
         waited, _ = self._ray.wait([opened], timeout=_PATIENCE)
         if not waited:

@@ -1,12 +1,13 @@
 """Several inputs of an ONNX model made one: columns of the observation, or constants."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from fdtasil.errors import SettingError, shown
+from fdtasil.files.onnx.nodes import Nodes, free_inputs
 
 if TYPE_CHECKING:
     import onnx
@@ -90,23 +91,24 @@ def bind(
     bound = onnx.ModelProto()
     bound.CopyFrom(model)
     graph = bound.graph
-    constants = {tensor.name for tensor in graph.initializer}
-    entries = {entry.name: entry for entry in graph.input if entry.name not in constants}
+    entries = free_inputs(graph)
     parts = _complete(entries, inputs, size)
     n = size or max(part.stop for part in parts.values() if isinstance(part, slice))
-    nodes: list[onnx.NodeProto] = []
-    for number, (name, part) in enumerate(parts.items()):
+    nodes = Nodes("fdtasil.input_")
+    for name, part in parts.items():
         kind = entries[name].type.tensor_type
-        feed = _Feed(f"fdtasil.{number}", name, kind.elem_type)
-        if isinstance(part, slice):
-            feed.take(part, [dimension.dim_value for dimension in kind.shape.dim])
-        else:
-            feed.hold(part, [dimension.dim_value for dimension in kind.shape.dim])
-        nodes += feed.nodes
-        graph.initializer.extend(feed.constants)
-    kept = list(graph.node)
-    del graph.node[:], graph.input[:]
-    graph.node.extend([*nodes, *kept])
+        shape = [dimension.dim_value for dimension in kind.shape.dim]
+        if isinstance(part, np.ndarray) and len(shape) != 2:
+            fixed = np.broadcast_to(part, [size or 1 for size in shape])
+            dtype = onnx.helper.tensor_dtype_to_np_dtype(kind.elem_type)
+            graph.initializer.append(onnx.numpy_helper.from_array(fixed.astype(dtype), name))
+            continue
+        held = isinstance(part, np.ndarray)
+        value = _repeat(nodes, part, shape[1]) if held else _take(nodes, part, shape)
+        nodes.node("Cast", value, to=kind.elem_type)
+        nodes.name_last(name)
+    nodes.put_before(bound)
+    del graph.input[:]
     graph.input.append(
         onnx.helper.make_tensor_value_info(_NAME, onnx.TensorProto.FLOAT, ["batch", n])
     )
@@ -174,64 +176,24 @@ def _check_width(entry: "onnx.ValueInfoProto", part: "slice | np.ndarray", liste
         )
 
 
-class _Feed:
-    """The nodes that make an input of what it is given."""
-
-    def __init__(self, prefix: str, name: str, kind: int) -> None:
-        self.nodes: list[onnx.NodeProto] = []
-        self.constants: list[onnx.TensorProto] = []
-        self._prefix, self._name, self._kind = prefix, name, kind
-
-    def take(self, columns: slice, shape: list[int]) -> None:
-        """Give it columns of the observation, in the shape that it has."""
-        ends = (columns.start, columns.stop, 1, 1)
-        names = [
-            self._keep(what, np.array([end], np.int64))
-            for what, end in zip(("starts", "ends", "axes", "steps"), ends, strict=True)
-        ]
-        flat = self._node("Slice", _NAME, *names)
-        if len(shape) > 2 and all(size > 0 for size in shape[1:]):
-            flat = self._node("Reshape", flat, self._keep("shape", np.array([-1, *shape[1:]])))
-        self._cast(flat)
-
-    def hold(self, value: np.ndarray, shape: list[int]) -> None:
-        """Give it a constant, a row for each observation where its first axis is one of rows."""
-        import onnx
-
-        if len(shape) != 2:
-            fixed = np.broadcast_to(value, [size or 1 for size in shape])
-            dtype = onnx.helper.tensor_dtype_to_np_dtype(self._kind)
-            self.constants.append(onnx.numpy_helper.from_array(fixed.astype(dtype), self._name))
-            return
-        width = shape[1] or value.size
-        row = np.broadcast_to(value.reshape(1, -1), (1, width)).astype(np.float32)
-        ends = [self._keep(what, np.array([end], np.int64)) for what, end in _FIRST]
-        # Columns of zeros as long as the batch; observations are finite.
-        first = self._node("Slice", _NAME, *ends)
-        zeros = self._node("Mul", first, self._keep("zero", np.zeros((1, 1), np.float32)))
-        self._cast(self._node("Add", zeros, self._keep("row", row)))
-
-    def _cast(self, value: str) -> None:
-        import onnx
-
-        self.nodes.append(onnx.helper.make_node("Cast", [value], [self._name], to=self._kind))
-
-    def _node(self, operator: str, *values: str) -> str:
-        import onnx
-
-        name = f"{self._prefix}.{len(self.nodes)}"
-        self.nodes.append(onnx.helper.make_node(operator, list(values), [name]))
-        return name
-
-    def _keep(self, what: str, value: np.ndarray) -> str:
-        import onnx
-
-        name = f"{self._prefix}.{what}"
-        self.constants.append(onnx.numpy_helper.from_array(value, name))
-        return name
+def _take(nodes: Nodes, columns: slice, shape: Sequence[int]) -> str:
+    """Add columns of the observation, in the shape that an input has."""
+    flat = _sliced(nodes, columns.start, columns.stop)
+    if len(shape) > 2 and all(size > 0 for size in shape[1:]):
+        flat = nodes.node("Reshape", flat, nodes.integers([-1, *shape[1:]]))
+    return flat
 
 
-_FIRST = (("starts", 0), ("ends", 1), ("axes", 1), ("steps", 1))
+def _repeat(nodes: Nodes, value: np.ndarray, width: int) -> str:
+    """Add a row of a constant for each observation."""
+    # Columns of zeros as long as the batch; observations are finite.
+    zeros = nodes.node("Mul", _sliced(nodes, 0, 1), nodes.constant([[0.0]]))
+    row = np.broadcast_to(value.reshape(1, -1), (1, width or value.size))
+    return nodes.node("Add", zeros, nodes.constant(row))
+
+
+def _sliced(nodes: Nodes, start: int, stop: int) -> str:
+    return nodes.node("Slice", _NAME, *(nodes.integers([end]) for end in (start, stop, 1, 1)))
 
 
 def _described(entry: "onnx.ValueInfoProto") -> str:

@@ -1,15 +1,17 @@
 """Torch modules as ONNX graphs: a layer is a node or a few, and a module may write its own."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
-from torch import Tensor, nn
+from torch import nn
+
+from fdtasil.files.onnx.nodes import Nodes
 
 if TYPE_CHECKING:
     import onnx
 
-__all__ = ["OPSET", "Graph", "can_write", "write_model"]
+__all__ = ["OPSET", "add_module", "can_write", "write_model"]
 
 OPSET = 18
 """Old enough for the runtimes on robots, new enough for torch's exporter."""
@@ -20,52 +22,20 @@ _IR_VERSION = 8  # the oldest that has this opset
 class Writable(Protocol):
     """A module that knows its own nodes."""
 
-    def write_onnx(self, graph: "Graph", value: str) -> str:
+    def write_onnx(self, nodes: Nodes, value: str) -> str:
         """Add the nodes that turn `value` into the module's answer, and return its name."""
         ...
 
 
-class Graph:
-    """Nodes and constants of a graph that grows."""
+def add_module(nodes: Nodes, module: nn.Module, value: str) -> str:
+    """Add what turns `value` into a module's answer, and return its name.
 
-    def __init__(self) -> None:
-        self.nodes: list[onnx.NodeProto] = []
-        self.constants: list[onnx.TensorProto] = []
-
-    def constant(self, value: Tensor | np.ndarray | float) -> str:
-        """Add a float32 constant, and return its name."""
-        from onnx import numpy_helper
-
-        plain = value.detach().cpu().numpy() if isinstance(value, Tensor) else value
-        name, array = f"constant_{len(self.constants)}", np.array(plain, np.float32)
-        self.constants.append(numpy_helper.from_array(array, name))
-        return name
-
-    def integers(self, values: Sequence[int] | int) -> str:
-        """Add a constant of integers, and return its name."""
-        from onnx import numpy_helper
-
-        name = f"constant_{len(self.constants)}"
-        self.constants.append(numpy_helper.from_array(np.array(values, np.int64), name))
-        return name
-
-    def node(self, operator: str, *values: str, **attributes: Any) -> str:
-        """Add a node, and return the name of its value."""
-        from onnx import helper
-
-        name = f"value_{len(self.nodes)}"
-        self.nodes.append(helper.make_node(operator, values, [name], name, **attributes))
-        return name
-
-    def module(self, module: nn.Module, value: str) -> str:
-        """Add what turns `value` into a module's answer, and return its name.
-
-        Raises:
-            KeyError: If it is a layer without a row in the table.
-        """
-        if isinstance(module, Writable):
-            return module.write_onnx(self, value)
-        return LAYERS[type(module)](self, module, value)
+    Raises:
+        KeyError: If it is a layer without a row in the table.
+    """
+    if isinstance(module, Writable):
+        return module.write_onnx(nodes, value)
+    return LAYERS[type(module)](nodes, module, value)
 
 
 def can_write(module: nn.Module) -> bool:
@@ -85,73 +55,73 @@ def write_model(module: nn.Module, observation_size: int, action_size: int) -> "
     """
     from onnx import TensorProto, helper
 
-    graph = Graph()
-    if graph.module(module, "obs") == "obs":
-        graph.node("Identity", "obs")
-    graph.nodes[-1].output[0] = "actions"
+    nodes = Nodes()
+    if add_module(nodes, module, "obs") == "obs":
+        nodes.node("Identity", "obs")
+    nodes.name_last("actions")
     ends = [
         helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", size])
         for name, size in (("obs", observation_size), ("actions", action_size))
     ]
-    body = helper.make_graph(graph.nodes, "policy", ends[:1], ends[1:], graph.constants)
+    body = helper.make_graph(nodes.nodes, "policy", ends[:1], ends[1:], nodes.constants)
     opset = [helper.make_opsetid("", OPSET)]
     return helper.make_model(
         body, opset_imports=opset, ir_version=_IR_VERSION, producer_name="fdtasil"
     )
 
 
-Writer = Callable[[Graph, Any, str], str]
+Writer = Callable[[Nodes, Any, str], str]
 
 
 def _one(operator: str, **fields: str) -> Writer:
     """Return the writer of a layer that is one node; `fields` name attributes of the layer."""
 
-    def write(graph: Graph, layer: nn.Module, value: str) -> str:
+    def write(nodes: Nodes, layer: nn.Module, value: str) -> str:
         attributes = {name: float(getattr(layer, field)) for name, field in fields.items()}
-        return graph.node(operator, value, **attributes)
+        return nodes.node(operator, value, **attributes)
 
     return write
 
 
-def _sequential(graph: Graph, layers: nn.Sequential, value: str) -> str:
+def _sequential(nodes: Nodes, layers: nn.Sequential, value: str) -> str:
     for layer in layers:
-        value = graph.module(layer, value)
+        value = add_module(nodes, layer, value)
     return value
 
 
-def _linear(graph: Graph, layer: nn.Linear, value: str) -> str:
-    constants = [graph.constant(layer.weight)]
-    constants += [] if layer.bias is None else [graph.constant(layer.bias)]
-    return graph.node("Gemm", value, *constants, transB=1)
+def _linear(nodes: Nodes, layer: nn.Linear, value: str) -> str:
+    constants = [nodes.constant(layer.weight)]
+    constants += [] if layer.bias is None else [nodes.constant(layer.bias)]
+    return nodes.node("Gemm", value, *constants, transB=1)
 
 
-def _gelu(graph: Graph, layer: nn.GELU, value: str) -> str:
+def _gelu(nodes: Nodes, layer: nn.GELU, value: str) -> str:
     # In this order onnxruntime replaces them by one kernel: three quarters of the time.
     if layer.approximate == "tanh":
-        cube = graph.node("Mul", graph.node("Mul", value, value), value)
-        inner = graph.node("Add", value, graph.node("Mul", cube, graph.constant(0.044715)))
-        scaled = graph.node("Mul", inner, graph.constant((2 / np.pi) ** 0.5))
-        bent = graph.node("Tanh", scaled)
+        cube = nodes.node("Mul", nodes.node("Mul", value, value), value)
+        inner = nodes.node("Add", value, nodes.node("Mul", cube, nodes.constant(0.044715)))
+        scaled = nodes.node("Mul", inner, nodes.constant((2 / np.pi) ** 0.5))
+        bent = nodes.node("Tanh", scaled)
     else:
-        bent = graph.node("Erf", graph.node("Div", value, graph.constant(2**0.5)))
-    product = graph.node("Mul", value, graph.node("Add", bent, graph.constant(1.0)))
-    return graph.node("Mul", product, graph.constant(0.5))
+        bent = nodes.node("Erf", nodes.node("Div", value, nodes.constant(2**0.5)))
+    product = nodes.node("Mul", value, nodes.node("Add", bent, nodes.constant(1.0)))
+    return nodes.node("Mul", product, nodes.constant(0.5))
 
 
-def _silu(graph: Graph, layer: nn.SiLU, value: str) -> str:
-    return graph.node("Mul", value, graph.node("Sigmoid", value))
+def _silu(nodes: Nodes, layer: nn.SiLU, value: str) -> str:
+    return nodes.node("Mul", value, nodes.node("Sigmoid", value))
 
 
-def _hardtanh(graph: Graph, layer: nn.Hardtanh, value: str) -> str:
-    low, high = graph.constant(layer.min_val), graph.constant(layer.max_val)
-    return graph.node("Clip", value, low, high)
+def _hardtanh(nodes: Nodes, layer: nn.Hardtanh, value: str) -> str:
+    low, high = nodes.constant(layer.min_val), nodes.constant(layer.max_val)
+    return nodes.node("Clip", value, low, high)
 
 
-def _softplus(graph: Graph, layer: nn.Softplus, value: str) -> str:
+def _softplus(nodes: Nodes, layer: nn.Softplus, value: str) -> str:
     if layer.beta == 1:
-        return graph.node("Softplus", value)
-    beta = graph.constant(layer.beta)
-    return graph.node("Div", graph.node("Softplus", graph.node("Mul", value, beta)), beta)
+        return nodes.node("Softplus", value)
+    beta = nodes.constant(layer.beta)
+    return nodes.node("Div", nodes.node("Softplus", nodes.node("Mul", value, beta)), beta)
 
 
 LAYERS: dict[type[nn.Module], Writer] = {
@@ -160,7 +130,7 @@ LAYERS: dict[type[nn.Module], Writer] = {
     nn.GELU: _gelu,
     nn.Hardswish: _one("HardSwish"),
     nn.Hardtanh: _hardtanh,
-    nn.Identity: lambda graph, layer, value: value,
+    nn.Identity: lambda nodes, layer, value: value,
     nn.LeakyReLU: _one("LeakyRelu", alpha="negative_slope"),
     nn.Linear: _linear,
     nn.Mish: _one("Mish"),

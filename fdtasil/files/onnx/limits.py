@@ -7,6 +7,7 @@ first, and one thread that looks at the running calls now and then the second.
 
 import threading
 import time
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cache
 from types import ModuleType
@@ -60,9 +61,9 @@ def limit_process(size: int) -> None:
 
 
 def run_within_limits(
-    session: "onnxruntime.InferenceSession", output: str, feed: dict[str, np.ndarray]
-) -> np.ndarray:
-    """Return one output of a model.
+    session: "onnxruntime.InferenceSession", outputs: Sequence[str], feed: dict[str, np.ndarray]
+) -> list[np.ndarray]:
+    """Return some outputs of a model.
 
     Raises:
         TimeoutError: If it takes longer than `CALL_SECONDS`. A call ends between two operators,
@@ -72,7 +73,7 @@ def run_within_limits(
     call = _Call(runtime().RunOptions())
     _watch(call)
     try:
-        return np.asarray(session.run([output], feed, call.options)[0])
+        return [np.asarray(found) for found in session.run(outputs, feed, call.options)]
     except Exception as error:
         if call.looks > _LOOKS:
             message = f"one call took more than {CALL_SECONDS:g} s and was ended"

@@ -8,7 +8,8 @@ import numpy as np
 
 from fdtasil.checks import spelt
 from fdtasil.errors import ExpertError, SettingError, shown
-from fdtasil.files.onnx.limits import limit_process
+from fdtasil.files.onnx.limits import limit_process, run_within_limits
+from fdtasil.files.onnx.nodes import free_inputs
 from fdtasil.files.onnx.session import open_session
 
 if TYPE_CHECKING:
@@ -50,8 +51,7 @@ def find_memory(
     Raises:
         SettingError: If a name is not there.
     """
-    constants = {tensor.name for tensor in model.graph.initializer}
-    inputs = {entry.name: entry for entry in model.graph.input if entry.name not in constants}
+    inputs = free_inputs(model.graph)
     outputs = {entry.name: entry for entry in model.graph.output}
     if given is not None:
         for name, there in (
@@ -160,9 +160,9 @@ class RecurrentPolicy:
             feed[entry.name] = _as(memory[0, start:stop].reshape(part), entry.type)
             start = stop
         names = [self.output, *(leaving for _, leaving in self._pairs)]
-        actions, *after = self._session.run(names, feed)
-        joined = np.concatenate([np.asarray(part, np.float32).reshape(1, -1) for part in after], 1)
-        return np.asarray(actions, np.float32).reshape(1, -1), joined
+        actions, *after = run_within_limits(self._session, names, feed)
+        joined = np.concatenate([part.astype(np.float32).reshape(1, -1) for part in after], 1)
+        return actions.astype(np.float32).reshape(1, -1), joined
 
     def _shape(self) -> tuple[int, ...]:
         """Of one observation, as the file has it: lengths of one but for the last."""

@@ -58,7 +58,8 @@ def run_session(
     entry = session.get_inputs()[0]
     wanted = {"tensor(float)": np.float32, "tensor(float16)": np.float16}
     batch = observations.astype(wanted.get(entry.type, np.float64), copy=False)
-    return run_within_limits(session, output, {entry.name: batch}).astype(np.float32, copy=False)
+    (found,) = run_within_limits(session, [output], {entry.name: batch})
+    return found.astype(np.float32, copy=False)
 
 
 def is_batched(session: "onnxruntime.InferenceSession") -> bool:
