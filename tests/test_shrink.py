@@ -49,6 +49,8 @@ def test_the_smallest_that_keeps_the_level(run, tmp_path):
     # Answers are those of the run: only acting and the gate ask, and never a probe.
     assert found.result.queries["probe"] == found.result.queries["act"] == 0
     assert "<" in str(found)
+    plain = found.smallest_cloned
+    assert f"; cloned plainly: {plain.name if plain else 'none'}\n" in str(found)
     table = json.loads((tmp_path / "s" / "sizes.json").read_text())
     assert [one["bytes"] for one in table["candidates"]] == [o.bytes for o in found.candidates]
     assert (tmp_path / "s" / "sizes.png").stat().st_size > 1000

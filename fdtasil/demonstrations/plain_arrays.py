@@ -8,6 +8,7 @@ from fdtasil.demonstrations.dataset import Dataset, check_dataset
 from fdtasil.demonstrations.states import Demonstrations
 from fdtasil.errors import SettingError
 from fdtasil.rollouts.flattening import unbounded
+from fdtasil.rollouts.spaces import to_numpy
 
 __all__ = ["from_arrays"]
 
@@ -68,7 +69,7 @@ def from_arrays(
 
 
 def _numbers(name: str, given: Any) -> np.ndarray:
-    found = given.detach().cpu().numpy() if hasattr(given, "detach") else np.asarray(given)
+    found = to_numpy(given)
     if found.dtype.kind in "biuf" and not np.ma.is_masked(given):
         return np.ascontiguousarray(found, np.float32)
     raise SettingError(f"{name} of {found.dtype}", "an array of plain numbers", "convert them")

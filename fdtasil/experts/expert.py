@@ -35,7 +35,7 @@ class Hints:
         output: Name of the ONNX output that holds the actions, or None.
         inputs: What the inputs of an ONNX file are given, where it has several.
         memory: Inputs that hold a memory, and the outputs that it comes out of.
-        trust: "pickle" where code inside a file may be run.
+        trust: "pickle" where code inside a file may be run, "c" where a C file may be compiled.
         timeout: Seconds that a batch may take, or None.
         spaces: Of the environment, or None.
     """

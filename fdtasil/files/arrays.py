@@ -8,13 +8,12 @@ from typing import IO
 import numpy as np
 
 from fdtasil.files.names import stays_inside
-from fdtasil.files.reading import FILE_LIMIT
+from fdtasil.files.reading import check_unpacked
 
 __all__ = ["array_from_bytes", "arrays_from_bytes"]
 
 _MEMBERS = 64
-# A few kilobytes of zip can unpack to gigabytes, so the sizes are looked at before unpacking.
-_SMALL, _RATIO = 2**26, 100
+_LONGEST = 2**26  # of an empty array's axes
 _DIMENSIONS = 8
 _HEADERS = {
     (1, 0): np.lib.format.read_array_header_1_0,
@@ -38,9 +37,7 @@ def arrays_from_bytes(data: bytes) -> dict[str, np.ndarray]:
             raise ValueError(f"{len(members)} members, or two of one name")
         if not all(name.endswith(".npy") and stays_inside(name) for name in names):
             raise ValueError("members that are no arrays")
-        size = sum(member.file_size for member in members)
-        if size > min(FILE_LIMIT, max(_SMALL, _RATIO * len(data))):
-            raise ValueError(f"it unpacks from {len(data):,} to {size:,} bytes")
+        check_unpacked(len(data), sum(member.file_size for member in members))
         arrays = {}
         for member in members:
             with archive.open(member) as file:
@@ -63,7 +60,7 @@ def _read(file: IO[bytes], size: int) -> np.ndarray:
         raise ValueError(f"an array of shape {shape}")
     if math.prod(shape) * dtype.itemsize > size:
         raise ValueError(f"an array of shape {shape} in {size:,} bytes")
-    if 0 in shape and max(shape) > _SMALL:
+    if 0 in shape and max(shape) > _LONGEST:
         raise ValueError(f"an array of shape {shape}")
     array = np.empty(shape[::-1] if fortran else shape, dtype)
     content = file.read(array.nbytes)

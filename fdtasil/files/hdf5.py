@@ -5,12 +5,11 @@ from pathlib import Path
 from typing import Any
 
 from fdtasil.files.names import stays_inside
-from fdtasil.files.reading import FILE_LIMIT, read_plain
+from fdtasil.files.reading import FILE_LIMIT, check_unpacked, read_plain
 
 __all__ = ["check_hdf5"]
 
 _OBJECTS = 10**6
-_SMALL, _RATIO = 2**26, 100
 
 
 def check_hdf5(path: Path) -> None:
@@ -46,8 +45,7 @@ def check_hdf5(path: Path) -> None:
                     todo.append(member)
                 elif isinstance(member, h5py.Dataset):
                     unpacked += _checked(member)
-            if unpacked > min(FILE_LIMIT, max(_SMALL, _RATIO * size)):
-                raise ValueError(f"it unpacks from {size:,} to {unpacked:,} bytes")
+            check_unpacked(size, unpacked)
 
 
 def _checked(data: Any) -> int:

@@ -9,11 +9,12 @@ from typing import Any
 
 from fdtasil.errors import ExpertError, first_line
 
-__all__ = ["FILE_LIMIT", "from_json", "read_limited", "read_plain"]
+__all__ = ["FILE_LIMIT", "check_unpacked", "from_json", "read_limited", "read_plain"]
 
 FILE_LIMIT = 2**34
 """Bytes that a file of ours may have."""
 _JSON_LIMIT = 2**25  # a hundred times the longest report; parsed it takes fifty times as much
+_SMALL, _RATIO = 2**26, 100
 
 
 def read_plain(path: Path, limit: int = FILE_LIMIT, *, follow: bool = True) -> bytes:
@@ -46,6 +47,22 @@ def read_plain(path: Path, limit: int = FILE_LIMIT, *, follow: bool = True) -> b
     if len(data) > limit:
         raise OSError(errno.EFBIG, f"it grew beyond {limit:,} bytes")
     return data
+
+
+def check_unpacked(packed: int, unpacked: int) -> None:
+    """Refuse what unpacks to more than 64 MiB and a hundred times its size.
+
+    A few kilobytes can unpack to gigabytes, so the sizes are looked at before.
+
+    Args:
+        packed: Bytes that it has.
+        unpacked: Bytes that it will have.
+
+    Raises:
+        ValueError: If it is refused.
+    """
+    if unpacked > min(FILE_LIMIT, max(_SMALL, _RATIO * packed)):
+        raise ValueError(f"it unpacks from {packed:,} to {unpacked:,} bytes")
 
 
 def from_json(data: bytes) -> Any:

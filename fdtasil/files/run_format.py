@@ -93,10 +93,10 @@ def _is_ours(folder: Path, name: str) -> bool:
         return False
     if not isinstance(values, dict):
         return False
-    return values.get("made_by") == _STAMP["made_by"] or _is_of_the_time_before(folder, values)
+    return values.get("made_by") == _STAMP["made_by"] or _is_of_the_time_before(values)
 
 
-def _is_of_the_time_before(folder: Path, values: dict[str, Any]) -> bool:
+def _is_of_the_time_before(values: dict[str, Any]) -> bool:
     """Whether a finished run has no format number yet: it may be replaced all the same."""
     versions = values.get("versions")
     fields = {"expert_sha256", "fit", "env", "seed"} <= values.keys()

@@ -48,12 +48,13 @@ class Distilled:
             or no environment to compare them in.
         history: Training losses, one entry for each 100 steps: round, step, loss, action_error,
             derivative_error, curvature_error, moved_error, validation_loss.
-        queries: Rows that the expert answered, by purpose: act, label, probe, check (the gate),
-            evaluate.
+        queries: Rows that the expert answered, by purpose: act, label, probe, calibrate, check
+            (the gate), evaluate, remember (a memory, carried over given states).
         settings: The exact arguments and what they resolved to, with versions; plain JSON.
         report: What `report.json` holds.
         dataset: The labelled states and the expert's answers around them; give it to
             `distill(dataset=...)` to train another student without asking.
+        view: What the student sees of an observation.
 
     Example:
         >>> import fdtasil, numpy as np

@@ -14,7 +14,16 @@ from typing import Any, Literal, get_args
 import gymnasium
 import numpy as np
 
-__all__ = ["Layout", "Mismatch", "Part", "Spaces", "UnknownSpace", "flat_layout", "layout_of"]
+__all__ = [
+    "Layout",
+    "Mismatch",
+    "Part",
+    "Spaces",
+    "UnknownSpace",
+    "flat_layout",
+    "layout_of",
+    "to_numpy",
+]
 
 Kind = Literal["number", "whole", "flag", "choice"]
 """A float, an integer, a boolean, or one of several: a score (or a one-hot number) for each."""
@@ -203,7 +212,7 @@ class Layout:
         flat = rows and (first.path or first.shape != given.shape)
         if flat and given.shape[-1] == self.size and given.dtype.kind == "f":
             return np.atleast_2d(given).astype(np.float32), given.ndim == 1
-        one = np.ndim(_as_array(_picked(given, first))) == len(first.shape)
+        one = np.ndim(to_numpy(_picked(given, first))) == len(first.shape)
         found = self.row(given)[None] if one else self.rows(given)
         return found.astype(np.float32), one
 
@@ -213,7 +222,7 @@ class Layout:
         Raises:
             Mismatch: If it is not of the space.
         """
-        picked = (_as_array(_picked(value, part)) for part in self.parts)
+        picked = (to_numpy(_picked(value, part)) for part in self.parts)
         return np.concatenate(
             [part.rows(one[None])[0] for part, one in zip(self.parts, picked, strict=True)]
         )
@@ -422,13 +431,13 @@ def _picked(value: Any, part: Part) -> Any:
     return found
 
 
-def _as_array(value: Any) -> Any:
+def to_numpy(value: Any) -> np.ndarray:
     """Return what may be a torch tensor, on whatever device, as an array."""
     return value.detach().cpu().numpy() if hasattr(value, "detach") else np.asarray(value)
 
 
 def _numbers(values: Any, name: str) -> np.ndarray:
-    found = _as_array(values)
+    found = to_numpy(values)
     if found.dtype.kind not in "biuf" or np.ma.is_masked(values) or found.ndim == 0:
         what = f"{name!r} of " if name else ""
         raise Mismatch(f"{what}{found.dtype} and shape {found.shape}, where numbers are promised")

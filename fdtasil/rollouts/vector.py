@@ -110,7 +110,7 @@ class _Gymnasium:
 
             actions = torch.as_tensor(actions).to(self._like.device)
         observations, rewards, terminated, truncated, _ = self._env.step(actions)
-        parts = TogetherStep(observations, *map(_array, (rewards, terminated, truncated)))
+        parts = TogetherStep(observations, *map(to_numpy, (rewards, terminated, truncated)))
         self._over = np.logical_or(parts.terminated, parts.truncated)
         return parts
 
@@ -196,10 +196,6 @@ def _own_limit(env: gymnasium.vector.VectorEnv) -> int | None:
 
 def _least(*limits: int | None) -> int | None:
     return min((limit for limit in limits if limit), default=None)
-
-
-def _array(values: Any) -> np.ndarray:
-    return values.detach().cpu().numpy() if hasattr(values, "detach") else np.asarray(values)
 
 
 def make_vector(name: str, count: int, kwargs: dict[str, Any]) -> gymnasium.vector.VectorEnv:

@@ -58,6 +58,7 @@ class Configuration:
         past: Length of the past that the student sees.
         remembered: Length of the expert's memory; 0 where it has none.
         own_derivatives: Whether the expert gives the derivatives that are matched.
+        spaces: Of the environment, where they are no plain boxes.
     """
 
     expert: str | None

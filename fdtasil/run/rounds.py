@@ -102,25 +102,20 @@ class Rounds:
         student: Policy | None,
     ) -> Lesson:
         """Return all that a round learns from: recorded, labelled, and probed around."""
-        made = list[Lesson]()
 
         def collect() -> Collected:
             if self.collecting is not None:
                 new = self._recorded(self.collecting, round_, count, before, student)
-                made.append(self._probed(round_, new, before, lesson))
-                return made[0].collected
+                return self._probed(round_, new, before, lesson)
             assert before is not None, "the dataset is given"
             if self.run.probes is None or self.run.probes_given:
                 return before
-            made.append(self._probed(round_, before, None, lesson))
-            return made[0].collected
+            return self._probed(round_, before, None, lesson)
 
-        collected = self._once(round_, COLLECTED, collect)
-        return (
-            made[0]
-            if made
-            else Lesson.of(collected, self.student_obs, lesson, self.run.spread, self.run.held)
-        )
+        return self._lesson(self._once(round_, COLLECTED, collect), lesson)
+
+    def _lesson(self, collected: Collected, before: Lesson | None) -> Lesson:
+        return Lesson.of(collected, self.student_obs, before, self.run.spread, self.run.held)
 
     def _recorded(
         self,
@@ -141,21 +136,19 @@ class Rounds:
         self, round_: int, stage: Stage[Collected], do: Callable[[], Collected]
     ) -> Collected:
         """Collect, or take up what was kept, if the expert is still the one that labelled it."""
-        made = list[Collected]()
-
-        def collect() -> Collected:
-            made.append(do())
-            return made[0]
-
-        found = self.checkpoints.once(round_, stage, collect)
-        if not made and round_ == 0 and self.collecting is not None:
+        kept = self.checkpoints.take_up(round_, stage)
+        if kept is None:
+            done = do()
+            self.checkpoints.keep(round_, stage, lambda: done)
+            return done
+        if round_ == 0 and self.collecting is not None:
             with self.checkpoints.account.asked_before():
-                self.collecting.check_kept(found)
-        return found
+                self.collecting.check_kept(kept)
+        return kept
 
     def _probed(
         self, round_: int, new: Collected, before: Collected | None, lesson: Lesson | None
-    ) -> Lesson:
+    ) -> Collected:
         """Join what is new with what was there before, and ask the probes around the new."""
         states, old = new.dataset.demonstrations, None
         whole = new
@@ -163,14 +156,12 @@ class Rounds:
             joined = before.dataset.demonstrations + states
             whole = replace(new, dataset=replace(before.dataset, demonstrations=joined))
             old = before.dataset.answers
-        around = Lesson.of(whole, self.student_obs, lesson, self.run.spread, self.run.held)
         if self.run.probes is None:
-            return around
-        answers = self._answers(round_, states, around)
+            return whole
+        answers = self._answers(round_, states, self._lesson(whole, lesson))
         answers = answers if old is None else old + answers
         source = self.checkpoints.asking.source
-        dataset = replace(whole.dataset, probes=source, answers=answers)
-        return replace(around, collected=replace(whole, dataset=dataset))
+        return replace(whole, dataset=replace(whole.dataset, probes=source, answers=answers))
 
     def _answers(self, round_: int, states: Demonstrations, lesson: Lesson) -> Answers:
         """Ask the probes around a round's states; the answers are kept on the way."""

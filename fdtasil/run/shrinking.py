@@ -130,12 +130,14 @@ class Shrunk:
                     f"{score_text(one.normalized_return):>9}  {interval_text(one.ci95):18}"
                     f"{plain:>8}{mark}"
                 )
-        found = self.smallest
+        found, plain = self.smallest, self.smallest_cloned
         lines.append(
             f"no student of these keeps {self.keep:.0%} of the expert's return"
             if found is None
             else f"the smallest that keeps {self.keep:.0%}: {found.name}, {found.bytes:,} bytes"
         )
+        if cloned:
+            lines[-1] += f"; cloned plainly: {'none' if plain is None else plain.name}"
         if self.confirmed is not None:
             score = score_text(self.confirmed.normalized_return)
             lines.append(f"from other starts: {score} {interval_text(self.confirmed.ci95)}")

@@ -20,8 +20,7 @@ from fdtasil.student.fit import Fit
 
 __all__ = [
     "ENVIRONMENT_FLAGS",
-    "KWARGS_TEXT",
-    "OPTIONS_TEXT",
+    "MADE_FLAGS",
     "distil",
     "opened",
     "seen",
@@ -30,11 +29,14 @@ __all__ = [
 
 Arguments = Mapping[str, Any]
 
-KWARGS_TEXT = """What the environment is made with, as JSON: '{"healthy_z_range": [0.8, 2.0]}'."""
-OPTIONS_TEXT = "What each reset is given as its options, as JSON."
-ENVIRONMENT_FLAGS: dict[str, tuple[Any, Any, str]] = {
-    "env_kwargs": (OptionalText, None, KWARGS_TEXT),
-    "reset_options": (OptionalText, None, OPTIONS_TEXT),
+_KWARGS_TEXT = """What the environment is made with, as JSON: '{"healthy_z_range": [0.8, 2.0]}'."""
+_OPTIONS_TEXT = "What each reset is given as its options, as JSON."
+MADE_FLAGS: dict[str, tuple[Any, Any, str]] = {
+    "env_kwargs": (OptionalText, None, _KWARGS_TEXT),
+    "reset_options": (OptionalText, None, _OPTIONS_TEXT),
+}
+"""Arguments of a command: how an environment is made and reset."""
+ENVIRONMENT_FLAGS = MADE_FLAGS | {
     "num_envs": (
         int,
         0,

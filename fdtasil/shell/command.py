@@ -17,6 +17,8 @@ __all__ = [
     "Flags",
     "OptionalEnvironment",
     "OptionalExpert",
+    "OptionalInt",
+    "OptionalPath",
     "OptionalText",
     "PolicyPath",
     "RunFolder",
@@ -26,6 +28,8 @@ __all__ = [
 OptionalExpert = Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="EXPERT")]
 OptionalEnvironment = Annotated[str | None, tyro.conf.Positional, tyro.conf.arg(metavar="ENV")]
 OptionalText = Annotated[str | None, tyro.conf.arg(metavar="TEXT")]
+OptionalPath = Annotated[Path | None, tyro.conf.arg(metavar="PATH")]
+OptionalInt = Annotated[int | None, tyro.conf.arg(metavar="INT")]
 PolicyPath = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="POLICY")]
 AgentPath = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="AGENT.zip")]
 ExpertPath = Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="EXPERT")]

@@ -4,7 +4,7 @@ from typing import Any
 
 from fdtasil.rollouts.wanted import import_module_of
 from fdtasil.run.diagnosing import diagnose
-from fdtasil.shell.call import wanted
+from fdtasil.shell.call import MADE_FLAGS, wanted
 from fdtasil.shell.command import EnvironmentId, Flags, PolicyPath, as_command
 
 __all__ = ["command"]
@@ -33,8 +33,5 @@ command = as_command(
             types={"student": PolicyPath, "env": EnvironmentId, "expert": str},
         )
     ],
-    {
-        "env_kwargs": (str | None, None, "What the environment is made with, as JSON."),
-        "reset_options": (str | None, None, "What each reset is given as its options, as JSON."),
-    },
+    MADE_FLAGS,
 )

@@ -1,43 +1,31 @@
 """`fdtasil render`: policies side by side in a film."""
 
+from inspect import Parameter
 from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
 
 from fdtasil.errors import SettingError
 from fdtasil.rollouts.wanted import import_module_of
 from fdtasil.run.film import choose_renderer, render
-from fdtasil.shell.call import wanted
-from fdtasil.shell.command import EnvironmentId
+from fdtasil.shell.call import MADE_FLAGS, wanted
+from fdtasil.shell.command import EnvironmentId, Flags, as_command
 
 __all__ = ["command"]
 
 
-def command(
-    env: EnvironmentId,
+def _render(
+    env: str,
     policies: tuple[str, ...],
-    /,
-    *,
-    out: Path = Path("film.mp4"),
-    seed: int = 0,
-    horizon: int | None = None,
-    every: int = 1,
-    height: int = 360,
-    env_kwargs: str | None = None,
-    reset_options: str | None = None,
+    out: Path,
+    env_kwargs: str | None,
+    reset_options: str | None,
+    **arguments: Any,
 ) -> None:
-    """Film policies side by side, from one start.
-
-    Args:
-        env: Gymnasium id (module:Id imports the module first).
-        policies: NAME=FILE of each, in their order from the left: an ONNX file, a zip, an address.
-        out: Ends with .mp4, .webp or .gif.
-        seed: Of the start.
-        horizon: Steps after which the episode is cut; default: the environment's time limit.
-        every: Steps between two pictures.
-        height: Of a picture, in pixels.
-        env_kwargs: What the environment is made with, as JSON.
-        reset_options: What each reset is given as its options, as JSON.
-    """
     choose_renderer()
+    if not policies:
+        raise SettingError("no policy", "one at least", "write for example student=student.onnx")
     named: dict[str, str] = {}
     for text in policies:
         name, equals, file = text.partition("=")
@@ -50,5 +38,29 @@ def command(
     import_module_of(env)
     place = wanted(env, env_kwargs, reset_options)
     assert place is not None
-    render(named, place, file, seed=seed, horizon=horizon, every=every, height=height)
+    render(named, place, file, **arguments)
     print(f"written: {out}")
+
+
+_Policies = Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="NAME=FILE")]
+
+command = as_command(
+    _render,
+    [
+        Flags(render, only=("seed", "horizon", "every", "height")),
+    ],
+    {
+        "env": (
+            EnvironmentId,
+            Parameter.empty,
+            "Gymnasium id (module:Id imports the module first).",
+        ),
+        "policies": (
+            _Policies,
+            Parameter.empty,
+            "NAME=FILE of each, in their order from the left: an ONNX file, a zip, an address.",
+        ),
+        "out": (Path, Path("film.mp4"), "Ends with .mp4, .webp or .gif."),
+        **MADE_FLAGS,
+    },
+)

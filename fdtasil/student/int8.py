@@ -1,8 +1,5 @@
 """A student's ONNX file in eight bits: a quarter of the bytes, each output with a scale."""
 
-import logging
-from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -11,6 +8,7 @@ import numpy as np
 
 from fdtasil.compute import in_turn
 from fdtasil.errors import ExportError, first_line
+from fdtasil.files.onnx.export import silenced
 from fdtasil.files.onnx.runtime import runtime
 from fdtasil.files.onnx.session import open_session, run_session
 from fdtasil.files.reading import read_plain
@@ -42,7 +40,7 @@ def as_int8(written: bytes, student: Student, states: np.ndarray, output: str) -
     rows = np.concatenate([states, moved]).astype(np.float32)
     runtime()  # without its telemetry
     try:
-        with in_turn(), _quietly():
+        with in_turn(), silenced():
             data = _quantised(written, rows)
     except Exception as error:  # onnxruntime's tools raise anything
         raise ExportError(
@@ -106,14 +104,3 @@ def _quantised(written: bytes, rows: np.ndarray) -> bytes:
             op_types_to_quantize=["Gemm"],
         )
         return read_plain(target)
-
-
-@contextmanager
-def _quietly() -> Iterator[None]:
-    """Keep the tools' advice, to preprocess a file that needs none, away from the user."""
-    before = logging.root.manager.disable
-    logging.disable(logging.WARNING)
-    try:
-        yield
-    finally:
-        logging.disable(before)

@@ -130,9 +130,9 @@ def _folded(student: Student) -> Layers | None:
     layers = [(weight, bias), *rest]
     if student.spaces is not None and student.spaces.actions.choices:
         # Scores in units of their own; the logits of a distribution are these.
-        half, centre = student.action_units, torch.zeros_like(student.action_units)
+        half = student.action_units
         weight, bias = layers[-1]
-        layers[-1] = weight * half[:, None], bias * half + centre
+        layers[-1] = weight * half[:, None], bias * half
     return layers
 
 

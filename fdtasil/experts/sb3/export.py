@@ -43,7 +43,8 @@ def export_sb3(
     in the graph. Its metadata say where it comes from.
 
     Args:
-        agent_zip: The zip of a SAC, TD3, DDPG, TQC, PPO, A2C or TRPO agent with an MLP policy.
+        agent_zip: The zip of a SAC, TD3, DDPG, TQC, PPO, A2C, TRPO, DQN or QR-DQN agent with an
+            MLP policy.
         out: The file to write.
         env: The agent's environment. It is checked that it fits, and the file is compared with
             the agent on states of a short rollout; without it, on random states.

@@ -19,7 +19,7 @@ from fdtasil.files.onnx.session import open_session, run_session
 if TYPE_CHECKING:
     import onnx
 
-__all__ = ["check_finite", "export_module"]
+__all__ = ["check_finite", "export_module", "silenced"]
 
 
 def check_finite(module: torch.nn.Module) -> None:
@@ -119,7 +119,7 @@ def _traced(module: torch.nn.Module, example: torch.Tensor) -> "onnx.ModelProto"
             'pip install "fdtasil[export]"',
         )
     try:
-        with in_turn(), usual_modes(), _silenced():
+        with in_turn(), usual_modes(), silenced():
             program = torch.onnx.export(
                 module,
                 (example[:2],),
@@ -149,8 +149,8 @@ def _traced(module: torch.nn.Module, example: torch.Tensor) -> "onnx.ModelProto"
 
 
 @contextmanager
-def _silenced() -> Iterator[None]:
-    """Keep the exporter's remarks about its own internals away from the user."""
+def silenced() -> Iterator[None]:
+    """Keep the remarks of the onnx tools about their own internals away from the user."""
     before = logging.root.manager.disable
     logging.disable(logging.WARNING)
     try:
