@@ -10,6 +10,7 @@ import gymnasium
 import numpy as np
 
 from fdtasil.errors import EnvironmentFault, warn
+from fdtasil.rollouts.spaces import to_numpy
 
 __all__ = ["Together", "TogetherStep", "make_vector", "vector_of"]
 
