@@ -18,6 +18,7 @@ __all__ = [
     "check_number",
     "check_path",
     "check_share",
+    "check_suffix",
     "spelt",
 ]
 
@@ -125,6 +126,19 @@ def check_path(name: str, value: object) -> Path:
                 return path
     example = f'write for example {name}="runs/latest"'
     raise SettingError(spelt(name, value), "a text, or a pathlib.Path", example)
+
+
+def check_suffix(path: Path, *suffixes: str) -> Path:
+    """Return the path of a file to write, whose name says what is written.
+
+    Raises:
+        SettingError: If it ends with another suffix.
+    """
+    if path.suffix.lower() in suffixes:
+        return path
+    listed = " or ".join(suffixes)
+    advice = f"write {path.with_suffix(suffixes[0]).name}"
+    raise SettingError(f"the file {path.name!r}", f"a name that ends with {listed}", advice)
 
 
 def spelt(name: str, value: object) -> str:

@@ -283,6 +283,10 @@ FAULTS = {
         263: "a row without an answer, which hides what is wrong with the others",
         265: "a bias that was replaced, and a copy of the weights that keeps the old one",
         266: "a call on a model card that can't be made",
+        267: "what was distilled by force, and can't be shrunk or diagnosed by force",
+        268: "another size than a student on a robot sees",
+        269: "a run that has not ended, in the place of a finished one",
+        270: "trust that does not reach the policy that asks for it",
     },
 }
 

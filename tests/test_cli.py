@@ -3,6 +3,7 @@
 import inspect
 import json
 import os
+import shutil
 import subprocess
 import sys
 from dataclasses import fields
@@ -420,3 +421,17 @@ def test_in_a_terminal_too_with_its_colours():
         process.wait(60)
     os.close(ours)
     assert said.startswith("fdtasil: --horizon 'ten'")
+
+
+@pytest.mark.fault(270)
+def test_trust_reaches_the_policy_that_asks_for_it(quick, inside, tmp_path):
+    if shutil.which("cc") is None:
+        pytest.skip("needs a C compiler")
+    expert = mlp_onnx(tmp_path / "e.onnx")
+    quick.export(tmp_path / "s.c")
+    short = ["--episodes", "2", "--horizon", "20"]
+    for command in ("evaluate", "diagnose"):
+        line = [command, tmp_path / "s.c", TOY, "--expert", expert, *short]
+        assert "--trust c" in inside(*line).stderr
+        done = inside(*line, "--trust", "c")
+        assert done.returncode == 0, done.stderr

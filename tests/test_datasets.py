@@ -367,3 +367,9 @@ def test_another_expert_than_the_datasets_is_warned_of_in_an_environment_too(run
 def test_what_only_an_environment_has_a_use_for_is_refused_without_one(asked, run):
     with pytest.raises(SettingError, match="without an environment"):
         fdtasil.distill(dataset=run, **asked, **SMALL)
+
+
+def test_what_is_no_dataset_is_not_written_for_minari(quick):
+    pytest.importorskip("minari")
+    with pytest.raises(SettingError, match=r"write result\.dataset"):
+        fdtasil.to_minari(quick, "me/x-v0")

@@ -139,7 +139,7 @@ def test_a_resumed_run_refuses_a_file_with_another_bit(tmp_path):
     flipped[weight] ^= 1
     expert.write_bytes(flipped)
     fdtasil.load_expert(expert)  # nothing in the file says that it is another
-    with pytest.raises(SettingError, match=r"expert_sha256 was '\w{64}', is '\w{64}'"):
+    with pytest.raises(SettingError, match=r"expert_sha256 was \w{12}\.\.\., is \w{12}\."):
         fdtasil.distill(expert, TOY, 2, resume=folder, **QUICK)
     expert.write_bytes(content)
     assert fdtasil.distill(expert, TOY, 2, resume=folder, **QUICK).evaluation
@@ -543,7 +543,7 @@ def test_the_limits_cost_one_thread(tmp_path, rows):
     for expert in experts:
         expert.ask(rows, "act")
     names = [thread.name for thread in threading.enumerate()]
-    assert names.count("fdtasil-limits") <= 2  # one more where a test was impatient
+    assert names.count("fdtasil-limits") <= 3  # one more for each test that was impatient
 
 
 # --- mutations

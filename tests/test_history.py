@@ -202,3 +202,23 @@ def test_what_is_remembered_is_what_an_environment_with_one_bound_takes():
         assert action == pytest.approx(student.act(whole)[0], abs=1e-6)
         assert action.min() < 0 or step > 0
         past = np.concatenate([row, np.maximum(action, 0), past[: -(N + M)]])
+
+
+@pytest.mark.fault(268)
+def test_what_a_student_can_not_see_is_said_where_it_runs(quick):
+    size = 5 + 2 * (5 + 2)  # of a history of three
+    student = fdtasil.Student(
+        fdtasil.Mlp(4),
+        np.zeros(size),
+        np.ones(size),
+        -np.ones(2),
+        np.ones(2),
+        torch.Generator(),
+    )
+    with pytest.raises(SettingError, match=r"History\(result\.student"):
+        fdtasil.History(quick, 3)
+    policy = fdtasil.History(student, 3)
+    with pytest.raises(SettingError, match=r"\(4,\).*\n.*\(5,\)"):
+        policy.predict(np.zeros(4))
+    with pytest.raises(SettingError, match="is a dict"):
+        student.predict({"a": 1})

@@ -5,7 +5,7 @@ import re
 from html.parser import HTMLParser
 
 import pytest
-from conftest import QUICK, TOY
+from conftest import QUICK, TOY, mlp_onnx
 
 import fdtasil
 from fdtasil.results.card import card_of
@@ -99,3 +99,34 @@ def test_notebooks_and_pickles(quick):
     again = pickle.loads(pickle.dumps(quick))
     assert again.student.to_bytes() == quick.student.to_bytes()
     assert again.evaluation == quick.evaluation
+
+
+@pytest.mark.fault(269)
+def test_a_run_that_has_not_ended_says_how_it_goes_on(linear, tmp_path, inside):
+    def stop(event):
+        raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fdtasil.distill(linear, TOY, 2, **QUICK, out=tmp_path / "run", callback=stop)
+    for line in (
+        ["report", tmp_path / "run"],
+        ["evaluate", tmp_path / "run", TOY, "--expert", tmp_path / "run"],
+        ["diagnose", tmp_path / "run", TOY, "--expert", tmp_path / "run"],
+    ):
+        done = inside(*line)
+        assert done.returncode == 1
+        assert "has not ended" in done.stderr
+        assert "--resume" in done.stderr
+
+
+def test_files_whose_names_say_something_else_are_not_written(quick_folder, inside, tmp_path):
+    done = inside("report", quick_folder, "--out", tmp_path / "r.pdf")
+    assert done.returncode == 2
+    assert "write r.html" in done.stderr
+    assert not (tmp_path / "r.pdf").exists()
+
+
+def test_the_time_of_an_expert_is_that_of_its_file(tmp_path):
+    result = fdtasil.distill(str(mlp_onnx(tmp_path / "e.onnx")), TOY, 2, **QUICK)
+    size = result.report["size"]["expert"]
+    assert 0 < size["onnx_microseconds"] < size["microseconds"]

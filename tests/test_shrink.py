@@ -12,8 +12,9 @@ import pytest
 from conftest import GAIN, QUICK, TOY, mlp_onnx
 
 import fdtasil
-from fdtasil.errors import FdtasilWarning, SettingError
+from fdtasil.errors import ExpertError, FdtasilWarning, SettingError
 from fdtasil.run.elsewhere import side_by_side
+from fdtasil.run.shrinking import Candidate
 
 pytestmark = pytest.mark.usefixtures("no_pictures")
 SIZES = [(2,), (16, 16)]
@@ -210,3 +211,42 @@ def test_students_see_what_the_runs_student_saw():
     through = fdtasil.distill(law, TOY, 2, student_obs=lambda rows: rows[:, :2], **QUICK)
     with pytest.raises(SettingError, match="sees through"):
         fdtasil.shrink(through, law, TOY, **options)
+
+
+@pytest.mark.fault(267)
+def test_what_was_distilled_by_force_is_shrunk_by_force():
+    def wild(rows):
+        return 9 * law(rows)  # beyond the bounds, which the gate refuses
+
+    with pytest.warns(FdtasilWarning, match="forced"):
+        some = fdtasil.distill(wild, TOY, 2, force=True, **QUICK)
+    options = {**FAST, "sizes": [(3,)], "fit": fdtasil.Fit(steps=5), "keep": 0.0}
+    with pytest.raises(ExpertError, match="force=True"):
+        fdtasil.shrink(some, wild, TOY, **options)
+    with pytest.warns(FdtasilWarning, match="forced"):
+        fdtasil.shrink(some, wild, TOY, **options, force=True)
+    with pytest.warns(FdtasilWarning, match="forced"):
+        fdtasil.diagnose(some, wild, TOY, episodes=2, horizon=20, force=True)
+
+
+def test_a_run_that_was_made_anew_is_told_what_to_remove(run, tmp_path):
+    options = {**FAST, "fit": fdtasil.Fit(steps=5), "cloned": False, "keep": 0.0}
+    fdtasil.shrink(run, law, TOY, **options, out=tmp_path / "s")
+    other = fdtasil.distill(law, TOY, 5, **{**QUICK, "episodes": 3, "horizon": 30, "seed": 3})
+    options["seed"] = 0
+    with pytest.raises(SettingError, match=r"dataset was [0-9a-f]{12}\.\.\., .*\n.*\n.*remove "):
+        fdtasil.shrink(other, law, TOY, **options, out=tmp_path / "s")
+
+
+def test_where_no_share_means_anything_none_is_chosen(run, monkeypatch):
+    monkeypatch.setattr("fdtasil.run.shrinking._candidate", _unknown)
+    options = {**FAST, "sizes": [(3,)], "fit": fdtasil.Fit(steps=5)}
+    found = fdtasil.shrink(run, law, TOY, **options)
+    assert "means nothing here" in str(found)
+    assert "no student of these" not in str(found)
+    assert found.draw().startswith(b"\x89PNG")
+
+
+def _unknown(job, _):
+    plain = job.cloned is not None
+    return Candidate(job.hidden, job.activation, plain, 1, 1, 1.0, None, None, 1.0)

@@ -138,10 +138,14 @@ def to_minari(dataset: Dataset, dataset_id: str, **about: str) -> "minari.Minari
         **about: Minari's algorithm_name, author, author_email, code_permalink, description.
 
     Raises:
-        SettingError: If minari is not installed.
+        SettingError: If minari is not installed, or it is no dataset.
         StorageError: If the dataset exists already or can't be written.
     """
     minari = _minari()
+    if not isinstance(dataset, Dataset):
+        raise SettingError(
+            f"dataset is a {type(dataset).__name__}", "a Dataset", "write result.dataset"
+        )
     # Its type says lists, it takes arrays, and its own module would import jax to add steps.
     buffer: Any = importlib.import_module("minari.data_collector").EpisodeBuffer
     states, n = dataset.demonstrations, dataset.sizes[0]

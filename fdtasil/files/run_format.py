@@ -12,7 +12,7 @@ from fdtasil.files.names import check_no_links, inside
 from fdtasil.files.reading import from_json, read_plain
 from fdtasil.files.storage import COMING, LOCK, MANIFEST, to_json
 
-__all__ = ["CHECKPOINTS", "COMMAND", "CONFIG", "check_free", "stamped", "unstamped"]
+__all__ = ["CHECKPOINTS", "COMMAND", "CONFIG", "check_free", "stamped", "unfinished", "unstamped"]
 
 FORMAT = 1
 """Number of the files' layout: one more whenever older files can't be read any longer."""
@@ -59,6 +59,15 @@ def _another_format(number: object, values: Mapping[str, Any], source: object) -
         f"{'no format number' if number is None else f'format {shown(number)}'}",
         f"format {FORMAT}",
         f"go on with {by}, which wrote it, or start anew in another folder",
+    )
+
+
+def unfinished(folder: Path) -> StorageError:
+    """Return what is said where a finished run was expected."""
+    return StorageError(
+        f"{folder} holds a run that has not ended",
+        "a finished run",
+        f'go on with it: resume="{folder}" and else the same (fdtasil distill --resume {folder})',
     )
 
 

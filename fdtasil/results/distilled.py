@@ -19,8 +19,22 @@ from fdtasil.files.border import reads
 from fdtasil.files.lock import locked
 from fdtasil.files.plain import as_kind, without_infinities
 from fdtasil.files.reading import from_json
-from fdtasil.files.run_format import CONFIG, check_free, stamped, unstamped
-from fdtasil.files.storage import add_to_folder, to_json, verify, write_bytes, write_folder
+from fdtasil.files.run_format import (
+    CHECKPOINTS,
+    CONFIG,
+    check_free,
+    stamped,
+    unfinished,
+    unstamped,
+)
+from fdtasil.files.storage import (
+    add_to_folder,
+    is_written,
+    to_json,
+    verify,
+    write_bytes,
+    write_folder,
+)
 from fdtasil.probes.answers import Answers
 from fdtasil.probes.calibration import Calibration
 from fdtasil.results.card import card_of
@@ -203,6 +217,8 @@ class Distilled:
 
     @classmethod
     def _read(cls, folder: Path, student_obs: StudentObservation | None) -> "Distilled":
+        if not is_written(folder) and (folder / CHECKPOINTS).is_dir():
+            raise unfinished(folder)
         files = verify(folder)
         settings = unstamped(files[CONFIG], folder / CONFIG, older=True)
         for name in _COUNTS & settings.keys():

@@ -13,7 +13,10 @@ __all__ = ["GOOD", "USUAL", "Fidelity", "fidelity_of"]
 RADII = (0.03, 0.1, 0.3, 1.0)
 USUAL = 0.3
 """Radius at which differences are compared in one number."""
-GOOD = "students at their expert's return have 27 to 85 %, those below half of it 86 to 108 %"
+GOOD = (
+    "on nine walking and swimming robots, students at their expert's return had 27 to 85 %, "
+    "below half of it 86 to 108 %; elsewhere it may be otherwise"
+)
 """What 80 % of the students of nine experts had (benchmarks/figures/fidelity.md)."""
 _DIRECTIONS = 8
 _STILL = 1e-6  # of half its range: an action that varies less does not

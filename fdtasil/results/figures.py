@@ -77,7 +77,8 @@ def draw_sizes(candidates: Sequence[Any], keep: float) -> bytes:
     low = min((one.ci95[0] for one in candidates if one.ci95 is not None), default=0.0)
     panel.set_ylim(max(low, -0.2) - 0.05, None)
     panel.grid(alpha=0.3, which="both", linewidth=0.5)
-    panel.legend(frameon=False, fontsize=8)
+    if any(one.ci95 is not None for one in candidates):
+        panel.legend(frameon=False, fontsize=8)
     return png_of(figure)
 
 
@@ -119,7 +120,8 @@ def draw_calibration(found: Calibration) -> bytes:
     change, agreement = figure.subplots(1, 2)
     change.plot(found.radii, found.change, color=_STUDENT, marker="o", markersize=3)
     change.axhline(found.noise_floor, color=_EXPERT, linestyle=":", label="noise floor")
-    change.set_yscale("log")
+    if max(*found.change, found.noise_floor) > 0:  # an expert that answers everywhere the same
+        change.set_yscale("log")
     change.set_title("change of the action", fontsize=9)
     change.set_ylabel("root mean square")
     agreement.plot(found.radii[1:], found.similarity[1:], color=_STUDENT, marker="o", markersize=3)

@@ -11,6 +11,7 @@ from fdtasil.experts.cost import multiply_adds
 from fdtasil.experts.expert import Expert
 from fdtasil.files.compiled import shared_function
 from fdtasil.files.onnx.graph import can_write, write_model
+from fdtasil.files.onnx.policy import OnnxPolicy
 from fdtasil.files.onnx.session import open_session
 from fdtasil.files.plain import to_plain
 from fdtasil.student.c_source import c_memory
@@ -19,6 +20,7 @@ from fdtasil.student.policy import Student
 __all__ = ["Size", "c_microseconds", "size_of_expert", "size_of_student", "size_text"]
 
 _CALLS, _REPEATS = 50, 5
+_QUICK = 1e-3  # seconds: a slower one would take as many again
 
 
 @dataclass(frozen=True)
@@ -31,8 +33,9 @@ class Size:
         multiply_adds: At most, for one observation; None where it does not say.
         microseconds: For one observation: `predict` of a student, a query of an expert; of one
             thread of the machine that the run was on. None where it was not asked.
-        onnx_microseconds: For one observation by onnxruntime, from the student's own file; None
-            of an expert, and of networks that only torch's exporter can write.
+        onnx_microseconds: For one observation by onnxruntime, from the student's own file, or
+            the expert's; None of other experts, and of networks that only torch's exporter can
+            write.
         c_constants: Bytes that a board needs for the numbers of the student's C file.
         c_memory: Bytes of static memory of this file. There is no other, but for the stack.
     """
@@ -111,7 +114,17 @@ def size_of_expert(expert: Expert, observation_size: int) -> Size:
         None if numbers is None else 4 * numbers,
         multiply_adds(expert, observation_size),
         None if seconds is None else _rounded(seconds),
+        _onnx_expert_microseconds(expert, seconds),
     )
+
+
+def _onnx_expert_microseconds(expert: Expert, seconds: float | None) -> float | None:
+    """Ask an ONNX file that is quick, past what counts and checks its answers."""
+    policy = expert.answer
+    if not isinstance(policy, OnnxPolicy) or seconds is None or seconds > _QUICK:
+        return None
+    row = np.zeros((1, policy.size), np.float32)
+    return _microseconds(lambda: policy(row))
 
 
 def size_text(size: dict[str, Any]) -> str:

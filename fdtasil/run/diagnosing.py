@@ -153,6 +153,7 @@ def diagnose(
     horizon: int | None = None,
     steps: int = 25,
     seed: int = 0,
+    force: bool = False,
     progress: bool = True,
 ) -> Diagnosis:
     """Measure how well a student's derivatives are its expert's, and what the expert forgives.
@@ -175,6 +176,7 @@ def diagnose(
         steps: From the start of each episode, how many steps are disturbed and followed. Legged
             robots are chaotic: after a few dozen the smallest disturbance has led elsewhere.
         seed: Of starts and directions.
+        force: Go on with a warning where the expert fails the gate but answers.
         progress: Show progress bars, in a terminal or a notebook.
 
     Raises:
@@ -192,6 +194,7 @@ def diagnose(
     """
     count, bars = check_count("episodes", episodes, 2), Progress(check_flag("progress", progress))
     check_count("seed", seed, 0, 2**32 - 1)
+    force = check_flag("force", force)
     looked_at, student_obs, history = judged_through(student, None, 1)
     if history > 1:
         raise SettingError(
@@ -212,7 +215,7 @@ def diagnose(
                 "a policy with a memory", "two that depend on the observation", "see evaluate()"
             )
         starts = episode_seeds(seed, "evaluation", 0, count)
-        own = examine(asked, pool, starts, length, bars, force=False)
+        own = examine(asked, pool, starts, length, bars, force=force)
         visited = own.observations[own.valid]
         seen = judged.columns if student_obs is None else student_obs
         view = View.of(visible(seen, n, 0), visited[:256])
@@ -250,8 +253,8 @@ def diagnose(
             fidelity,
             stability,
             largest,
-            stability.reached(largest),
-            law and law.gamma(largest),
+            stability.reached(largest) if largest else None,
+            law.gamma(largest) if law and largest else None,
             float(distances(first, path, scales).max()),
             int((path.lengths < first.lengths).sum()),
             float((~known).mean()),

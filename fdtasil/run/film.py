@@ -75,7 +75,7 @@ def render(
             f"out={str(out)!r}", f"a name that ends with {' or '.join(_WRITERS)}", "write film.mp4"
         )
     if not isinstance(policies, Mapping) or not policies:
-        found = f"policies is a {type(policies).__name__}"
+        found = f"policies is a {type(policies).__name__}" if policies else "no policies"
         raise SettingError(found, "names with policies", 'write {"student": student}')
     check_count("seed", seed, 0, 2**32 - 1)
     every, height = check_count("every", every), check_count("height", height, 32)

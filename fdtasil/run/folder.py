@@ -239,7 +239,13 @@ def _differences(before: Any, now: Any, name: str = "") -> list[str]:
                 before.get(key), now.get(key), f"{name}.{key}" if name else key
             )
         ]
-    return [] if before == now else [f"{name} was {before!r}, is {now!r}"]
+    return [] if before == now else [f"{name} was {_short(before)}, is {_short(now)}"]
+
+
+def _short(value: Any) -> str:
+    """Return a value as a message shows it: of a sha256 the beginning."""
+    is_hash = isinstance(value, str) and re.fullmatch("[0-9a-f]{64}", value)
+    return f"{value[:12]}..." if is_hash else repr(value)
 
 
 def _numbered(path: Path, round_: int, stage: str) -> list[Path]:

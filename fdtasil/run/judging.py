@@ -4,6 +4,7 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
+from fdtasil.errors import SettingError
 from fdtasil.experts.expert import Expert, Hints
 from fdtasil.experts.load import ExpertLike, open_expert
 from fdtasil.experts.onnx_expert import said_history
@@ -29,8 +30,12 @@ def judged_through(
 
     Raises:
         StorageError: If the folder is a run's, and damaged.
-        SettingError: If it sees through a function that is lost.
+        SettingError: If it is None, or sees through a function that is lost.
     """
+    if policy is None:
+        raise SettingError(
+            "None in the place of the policy to judge", "a result, a file, a function", "pass one"
+        )
     if isinstance(policy, str | Path) and os.path.isfile(Path(policy) / "student.safetensors"):
         policy = Distilled.load(policy)
     if isinstance(policy, Distilled):

@@ -110,6 +110,11 @@ class Shrunk:
         kept = (one for one in self.candidates if one.cloned == cloned and one.keeps(self.keep))
         return next(kept, None)
 
+    @property
+    def judged(self) -> bool:
+        """Whether any student has a share of the expert's return, and an interval of it."""
+        return any(one.ci95 is not None for one in self.candidates)
+
     def draw(self) -> bytes:
         """Return a picture: return against bytes, with and without probes, as a PNG."""
         return draw_sizes(self.candidates, self.keep)
@@ -131,12 +136,14 @@ class Shrunk:
                     f"{plain:>8}{mark}"
                 )
         found, plain = self.smallest, self.smallest_cloned
-        lines.append(
-            f"no student of these keeps {self.keep:.0%} of the expert's return"
-            if found is None
-            else f"the smallest that keeps {self.keep:.0%}: {found.name}, {found.bytes:,} bytes"
-        )
-        if cloned:
+        if not self.judged:
+            lines.append("a share of the expert's return means nothing here, so none is chosen")
+        elif found is None:
+            lines.append(f"no student of these keeps {self.keep:.0%} of the expert's return")
+        else:
+            size = f"{found.name}, {found.bytes:,} bytes"
+            lines.append(f"the smallest that keeps {self.keep:.0%}: {size}")
+        if self.judged and cloned:
             lines[-1] += f"; cloned plainly: {'none' if plain is None else plain.name}"
         if self.confirmed is not None:
             score = score_text(self.confirmed.normalized_return)
@@ -157,6 +164,7 @@ def shrink(
     horizon: int | None = None,
     seed: int | None = None,
     fit: Fit | None = None,
+    force: bool = False,
     out: str | Path | None = None,
     workers: int = 1,
     progress: bool = True,
@@ -180,6 +188,7 @@ def shrink(
         horizon: As in `distill`; left out, the run's.
         seed: Left out, the run's.
         fit: As in `distill`.
+        force: Go on with a warning where the expert fails the gate but answers.
         out: Folder of the runs, one for each student. What is done in it is taken up, so that it
             may be killed and begun again.
         workers: Students that are trained side by side, in processes; the expert must be a path
@@ -219,6 +228,7 @@ def shrink(
         "horizon": result.settings["horizon"] if horizon is None else horizon,
         "seed": result.settings["seed"] if seed is None else seed,
         "fit": fit,
+        "force": check_flag("force", force),
         "progress": False,
     }
     found = dict[_Job, Distilled]()
@@ -238,7 +248,7 @@ def shrink(
     shrunk = _confirmed(_judged(found, share), expert, env, settings)
     if folder is not None:
         _write(shrunk, folder)
-    if shrunk.result is None:
+    if shrunk.judged and shrunk.result is None:
         warn(f"no student of {len(jobs)} keeps {share:.0%} of the expert's return")
     return shrunk
 
@@ -343,12 +353,21 @@ def _trained(
         given["dataset"] = replace(settings["dataset"], probes=None, answers=None)
         given["fit"] = replace(settings["fit"] or Fit(), steps=job.cloned, epochs=None)
         probes = 0
-    if folder is not None:
-        place = folder / job.folder
-        kept = RunFolder(place, {})
-        given["resume" if kept.begun or kept.finished else "out"] = place
-    student = Mlp(job.hidden, job.activation)
-    return distill(expert, env, probes, student=student, **given)
+    train = partial(distill, expert, env, probes, student=Mlp(job.hidden, job.activation), **given)
+    if folder is None:
+        return train()
+    place = folder / job.folder
+    kept = RunFolder(place, {})
+    if not kept.begun and not kept.finished:
+        return train(out=place)
+    try:
+        return train(resume=place)
+    except SettingError as error:
+        if not error.found.startswith(str(place)):
+            raise
+        # The arguments, or the run itself, which may have been made anew since.
+        step = f"remove {folder}, or write another out= (--out)"
+        raise SettingError(error.found, "students of this call and this run", step) from error
 
 
 def _judged(found: dict[_Job, Distilled], keep: float) -> Shrunk:
@@ -371,6 +390,7 @@ def _confirmed(
         episodes=settings["evaluation_episodes"],
         horizon=settings["horizon"],
         seed=(settings["seed"] + OTHER_STARTS) % 2**32,
+        force=settings["force"],
         progress=settings["progress"],
     )
     return replace(shrunk, confirmed=confirmed)

@@ -14,14 +14,16 @@ from fdtasil.rollouts.wanted import Environment
 from fdtasil.run.events import Log
 from fdtasil.run.pipeline import distill
 from fdtasil.run.presets import preset_of
-from fdtasil.shell.command import OptionalText
+from fdtasil.shell.command import Flags, OptionalText
 from fdtasil.student.architectures import Mlp
 from fdtasil.student.fit import Fit
 
 __all__ = [
     "ENVIRONMENT_FLAGS",
+    "EXPERT_FLAGS",
     "MADE_FLAGS",
     "distil",
+    "judged",
     "opened",
     "seen",
     "wanted",
@@ -44,6 +46,10 @@ ENVIRONMENT_FLAGS = MADE_FLAGS | {
     ),
 }
 """Arguments of a command: how an environment is made and reset."""
+
+
+EXPERT_FLAGS = Flags(load_expert, only=("output", "inputs", "trust"), types={"inputs": str | None})
+"""Arguments of a command: how an expert is opened."""
 
 
 def wanted(
@@ -116,6 +122,12 @@ def seen(tokens: tuple[str, ...] | None) -> tuple[int, ...] | tuple[str, ...] | 
         return None
     numbers = [token for token in tokens if token.isascii() and token.isdigit()]
     return tuple(map(int, numbers)) if len(numbers) == len(tokens) else tokens
+
+
+def judged(policy: str, trust: Any) -> ExpertLike:
+    """Return a policy that is judged, opened with the trust that its kind asks for."""
+    asks = trust is not None and Path(policy).suffix in (".c", ".zip")
+    return load_expert(policy, trust=trust) if asks else policy
 
 
 def opened(

@@ -4,7 +4,7 @@ from typing import Any
 
 from fdtasil.rollouts.wanted import import_module_of
 from fdtasil.run.diagnosing import diagnose
-from fdtasil.shell.call import MADE_FLAGS, wanted
+from fdtasil.shell.call import EXPERT_FLAGS, MADE_FLAGS, judged, opened, wanted
 from fdtasil.shell.command import EnvironmentId, Flags, PolicyPath, as_command
 
 __all__ = ["command"]
@@ -14,6 +14,9 @@ def _diagnose(
     student: str,
     expert: str,
     env: str,
+    output: str | None,
+    inputs: str | None,
+    trust: Any,
     env_kwargs: str | None,
     reset_options: str | None,
     **arguments: Any,
@@ -21,7 +24,9 @@ def _diagnose(
     import_module_of(env)
     place = wanted(env, env_kwargs, reset_options)
     assert place is not None
-    print(diagnose(student, expert, place, **arguments))
+    asked = opened(expert, place, output=output, inputs=inputs, trust=trust)
+    assert asked is not None
+    print(diagnose(judged(student, trust), asked, place, **arguments))
 
 
 command = as_command(
@@ -31,7 +36,8 @@ command = as_command(
             diagnose,
             without=("progress",),
             types={"student": PolicyPath, "env": EnvironmentId, "expert": str},
-        )
+        ),
+        EXPERT_FLAGS,
     ],
     MADE_FLAGS,
 )

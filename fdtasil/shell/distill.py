@@ -10,7 +10,6 @@ from typing import Any
 
 from fdtasil.errors import SettingError, StorageError, shown, without_secrets
 from fdtasil.experts.expert import rows_text
-from fdtasil.experts.load import load_expert
 from fdtasil.files.border import reads
 from fdtasil.files.lock import locked
 from fdtasil.files.names import inside
@@ -24,7 +23,7 @@ from fdtasil.results.size import size_text
 from fdtasil.rollouts.wanted import import_module_of
 from fdtasil.run.pipeline import distill
 from fdtasil.shell.beside import evaluated_beside
-from fdtasil.shell.call import ENVIRONMENT_FLAGS, distil
+from fdtasil.shell.call import ENVIRONMENT_FLAGS, EXPERT_FLAGS, distil
 from fdtasil.shell.command import (
     Flags,
     OptionalEnvironment,
@@ -206,7 +205,7 @@ command = as_command(
         ),
         Flags(Mlp, types={"hidden": tuple[int, ...]}, open=True),
         Flags(Fit, open=True),
-        Flags(load_expert, only=("output", "inputs", "trust"), types={"inputs": str | None}),
+        EXPERT_FLAGS,
     ],
     {
         **ENVIRONMENT_FLAGS,

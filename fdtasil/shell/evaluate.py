@@ -2,10 +2,9 @@
 
 from typing import Any
 
-from fdtasil.experts.load import load_expert
 from fdtasil.rollouts.wanted import import_module_of
 from fdtasil.run.pipeline import evaluate
-from fdtasil.shell.call import ENVIRONMENT_FLAGS, opened, seen, wanted
+from fdtasil.shell.call import ENVIRONMENT_FLAGS, EXPERT_FLAGS, judged, opened, seen, wanted
 from fdtasil.shell.command import EnvironmentId, Flags, PolicyPath, as_command
 
 __all__ = ["command"]
@@ -26,9 +25,7 @@ def _evaluate(
     judge = opened(expert, place, output=output, inputs=inputs, trust=trust)
     assert judge is not None
     arguments["student_obs"] = seen(arguments["student_obs"])
-    compiled = policy.endswith(".c")  # the only policy that asks for trust of its own
-    judged = load_expert(policy, trust=trust) if compiled else policy
-    print(evaluate(judged, expert=judge, env=place, **arguments))
+    print(evaluate(judged(policy, trust), expert=judge, env=place, **arguments))
 
 
 command = as_command(
@@ -44,7 +41,7 @@ command = as_command(
                 "student_obs": tuple[str, ...] | None,
             },
         ),
-        Flags(load_expert, only=("output", "inputs", "trust"), types={"inputs": str | None}),
+        EXPERT_FLAGS,
     ],
     ENVIRONMENT_FLAGS,
 )

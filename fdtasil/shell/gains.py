@@ -68,7 +68,7 @@ def command(
         assert asked is not None, "who acted was opened"
         visited = looked.own.observations[looked.own.valid]
         scale = measure_scales(visited).units
-        chosen = looked.own.spread(states)
+        chosen = looked.own.spread(min(states, len(visited)))
         found = gains(asked, chosen, scale=scale, seed=seed)
     print(_summary(found))
     if file is not None:

@@ -3,7 +3,7 @@
 from pathlib import Path
 from typing import Literal
 
-from fdtasil.checks import check_count
+from fdtasil.checks import check_count, check_suffix
 from fdtasil.errors import printable, without_secrets
 from fdtasil.experts.examination import Looked, look_closely
 from fdtasil.files.storage import write_bytes
@@ -56,7 +56,7 @@ def command(
     """
     check_count("episodes", episodes)
     # Absolute from the beginning: an environment may change the working folder.
-    file = None if picture is None else picture.absolute()
+    file = None if picture is None else check_suffix(picture, ".png").absolute()
     import_module_of(env)
     place = wanted(env, env_kwargs, reset_options)
     source = opened(expert, place, output=output, inputs=inputs, trust=trust)

@@ -7,9 +7,10 @@ from typing import Annotated, Any
 import tyro
 
 from fdtasil.errors import SettingError
+from fdtasil.experts.load import ExpertLike, load_expert
 from fdtasil.rollouts.wanted import import_module_of
 from fdtasil.run.film import choose_renderer, render
-from fdtasil.shell.call import MADE_FLAGS, wanted
+from fdtasil.shell.call import MADE_FLAGS, judged, wanted
 from fdtasil.shell.command import EnvironmentId, Flags, as_command
 
 __all__ = ["command"]
@@ -19,6 +20,7 @@ def _render(
     env: str,
     policies: tuple[str, ...],
     out: Path,
+    trust: Any,
     env_kwargs: str | None,
     reset_options: str | None,
     **arguments: Any,
@@ -26,14 +28,14 @@ def _render(
     choose_renderer()
     if not policies:
         raise SettingError("no policy", "one at least", "write for example student=student.onnx")
-    named: dict[str, str] = {}
+    named: dict[str, ExpertLike] = {}
     for text in policies:
         name, equals, file = text.partition("=")
         if not equals or not name or name in named:
             raise SettingError(
                 f"the policy {text!r}", "NAME=FILE, each name once", "write student=student.onnx"
             )
-        named[name] = file
+        named[name] = judged(file, trust)
     file = out.absolute()  # an environment may change the folder
     import_module_of(env)
     place = wanted(env, env_kwargs, reset_options)
@@ -48,6 +50,7 @@ command = as_command(
     _render,
     [
         Flags(render, only=("seed", "horizon", "every", "height")),
+        Flags(load_expert, only=("trust",)),
     ],
     {
         "env": (

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+from fdtasil.checks import check_suffix
 from fdtasil.files.storage import write_bytes
 from fdtasil.results.distilled import Distilled
 from fdtasil.results.page import page_of
@@ -17,6 +18,6 @@ def command(run: RunFolder, /, *, out: Path | None = None) -> None:
         run: Folder of a finished run.
         out: Where; left out, RUN.html beside the folder.
     """
-    file = run.parent / f"{run.name}.html" if out is None else out
+    file = run.parent / f"{run.name}.html" if out is None else check_suffix(out, ".html")
     write_bytes(file, page_of(Distilled.load(run)).encode())
     print(f"written: {file}")

@@ -7,7 +7,7 @@ from typing import Any
 from fdtasil.rollouts.wanted import import_module_of
 from fdtasil.run.presets import preset_of
 from fdtasil.run.shrinking import LADDER, shrink
-from fdtasil.shell.call import MADE_FLAGS, wanted
+from fdtasil.shell.call import EXPERT_FLAGS, MADE_FLAGS, opened, wanted
 from fdtasil.shell.command import (
     EnvironmentId,
     ExpertPath,
@@ -29,6 +29,9 @@ def _shrink(
     widths: tuple[int, ...],
     layers: int,
     steps: int | None,
+    output: str | None,
+    inputs: str | None,
+    trust: Any,
     env_kwargs: str | None,
     reset_options: str | None,
     **arguments: Any,
@@ -37,9 +40,11 @@ def _shrink(
     import_module_of(env)
     place = wanted(env, env_kwargs, reset_options)
     assert place is not None
+    asked = opened(expert, place, output=output, inputs=inputs, trust=trust)
+    assert asked is not None
     found = shrink(
         run,
-        expert,
+        asked,
         place,
         sizes=[(width,) * layers for width in widths],
         fit=None if steps is None else preset_of("standard").fit_with(steps=steps),
@@ -61,9 +66,10 @@ command = as_command(
     [
         Flags(
             shrink,
-            only=("keep", "activations", "cloned", "evaluation_episodes", "workers"),
+            only=("keep", "activations", "cloned", "evaluation_episodes", "force", "workers"),
             types={"activations": tuple[str, ...]},
-        )
+        ),
+        EXPERT_FLAGS,
     ],
     {
         "run": (RunFolder, Parameter.empty, "Folder of a finished run."),

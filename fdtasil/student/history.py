@@ -33,6 +33,9 @@ class History:
     """
 
     def __init__(self, student: Student, history: int) -> None:
+        if not isinstance(student, Student):
+            found = f"a {type(student).__name__} in the place of a student"
+            raise SettingError(found, "a Student", "write History(result.student, history)")
         history, m = check_count("history", history), student.action_size
         self.observation_size, rest = present_size(student.observation_size, history, m)
         if rest or self.observation_size < 1:
@@ -41,7 +44,7 @@ class History:
                 f"H observations and H - 1 actions of {m}",
                 "pass the history that it was trained with",
             )
-        self._student = student
+        self._student, self._history = student, history
         self._bounds = student.low.cpu().numpy(), student.high.cpu().numpy()
         self._window = Window(history, self.observation_size, m)
 
@@ -54,6 +57,9 @@ class History:
     ) -> tuple[np.ndarray, None]:
         """Answer one observation (n,), and remember it.
 
+        Raises:
+            SettingError: If it has another shape.
+
         Args:
             observation: (n,) raw observation.
             state: Not used; what is remembered is kept here.
@@ -62,7 +68,13 @@ class History:
         """
         if episode_start:
             self._window.clear()
-        seen = np.asarray(observation, np.float32)
+        seen, n = np.asarray(observation, np.float32), self.observation_size
+        if seen.shape != (n,):
+            raise SettingError(
+                f"an observation of shape {seen.shape}",
+                f"({n},), one observation of a history of {self._history}",
+                "pass the environment's own; another history would ask for another size",
+            )
         rows = self._window.behind(seen)[None].astype(np.float32)
         action, spaces = self._student.answer(rows)[0], self._student.spaces
         if spaces is None:

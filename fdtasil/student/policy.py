@@ -177,8 +177,12 @@ class Student(nn.Module):
         """
         if self.spaces is not None:
             return self._in_spaces(observation, self.spaces), state
-        rows = np.asarray(observation, np.float32)
         n = self.observation_size
+        try:
+            rows = np.asarray(observation, np.float32)
+        except (TypeError, ValueError):
+            found = f"an observation that is a {type(observation).__name__}"
+            raise SettingError(found, f"({n},) or (B, {n}) numbers", "pass an array") from None
         if rows.ndim not in (1, 2) or rows.shape[-1] != n:
             raise SettingError(
                 f"observation of shape {rows.shape}",

@@ -7,6 +7,7 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
+from fdtasil.checks import check_suffix
 from fdtasil.compute import ask_module
 from fdtasil.errors import ExpertError, ExportError, SettingError
 from fdtasil.experts.sb3.agent import Agent, read_agent
@@ -97,6 +98,7 @@ def _check_out(out: Path, source: Path) -> None:
             "the name of a file that may be written",
             f"write out={source.with_suffix('.onnx').name!r}",
         )
+    check_suffix(out, ".onnx")
 
 
 def _random_states(agent: Agent) -> tuple[np.ndarray, str]:

@@ -37,6 +37,10 @@ class OnnxPolicy:
         size: n.
         rows: How many rows are asked at once; None for any number, 0 for one without a batch axis.
         session: The model, where it is open already.
+
+    Attributes:
+        output: As given.
+        size: n.
     """
 
     def __init__(
@@ -49,7 +53,7 @@ class OnnxPolicy:
         session: "Session | None" = None,
     ) -> None:
         self._arguments = data, name, output, size, rows
-        self.output, self._size, self._rows = output, size, rows
+        self.output, self.size, self._rows = output, size, rows
         self._session = open_session(data, name) if session is None else session
 
     def __reduce__(self) -> tuple[type["OnnxPolicy"], tuple[bytes, str, str, int, int | None]]:
@@ -69,7 +73,7 @@ class OnnxPolicy:
         return self._in_turn(observations, self._rows)
 
     def _in_turn(self, observations: np.ndarray, size: int) -> np.ndarray:
-        empty = np.zeros((-len(observations) % size, self._size), np.float32)
+        empty = np.zeros((-len(observations) % size, self.size), np.float32)
         padded = np.concatenate([observations, empty])
         parts = [
             run_session(self._session, self.output, padded[start : start + size])
@@ -78,7 +82,7 @@ class OnnxPolicy:
         return np.concatenate(parts)[: len(observations)]
 
     def _one_by_one(self, observations: np.ndarray) -> np.ndarray:
-        zeros = np.zeros((1, self._size), np.float32)  # for an empty batch, to know the width
+        zeros = np.zeros((1, self.size), np.float32)  # for an empty batch, to know the width
         rows = observations if len(observations) else zeros
         answers = [run_session(self._session, self.output, row) for row in rows]
         return np.stack(answers)[: len(observations)]
