@@ -41,9 +41,10 @@ if TYPE_CHECKING:
     from fdtasil.results.evaluation import Evaluation
     from fdtasil.rollouts.wanted import Environment
     from fdtasil.run.diagnosing import diagnose
+    from fdtasil.run.evaluating import evaluate
     from fdtasil.run.events import Event, Log
     from fdtasil.run.film import render
-    from fdtasil.run.pipeline import distill, evaluate
+    from fdtasil.run.pipeline import distill
     from fdtasil.run.shrinking import shrink
     from fdtasil.student.architectures import Mlp
     from fdtasil.student.fit import Fit
@@ -98,7 +99,8 @@ _ROOMS = {
     "run.diagnosing": ("diagnose",),
     "run.events": ("Event", "Log"),
     "run.film": ("render",),
-    "run.pipeline": ("distill", "evaluate"),
+    "run.evaluating": ("evaluate",),
+    "run.pipeline": ("distill",),
     "run.shrinking": ("shrink",),
     "student.architectures": ("Mlp",),
     "student.fit": ("Fit",),

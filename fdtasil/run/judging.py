@@ -4,6 +4,7 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
+from fdtasil.checks import check_count
 from fdtasil.errors import SettingError
 from fdtasil.experts.expert import Expert, Hints
 from fdtasil.experts.load import ExpertLike, open_expert
@@ -15,7 +16,7 @@ from fdtasil.rollouts.spaces import Spaces, flat_layout
 from fdtasil.student.policy import Student
 from fdtasil.student.view import StudentObservation, Unseen
 
-__all__ = ["judged_in", "judged_through"]
+__all__ = ["check_history", "judged_in", "judged_through"]
 
 
 def judged_through(
@@ -62,3 +63,17 @@ def judged_in(
     if spaces is not None and (not whole or judged.columns is not None):
         spaces = Spaces(flat_layout(size or 1), spaces.actions)
     return in_spaces(judged, spaces)
+
+
+def check_history(history: object, student_obs: object) -> int:
+    """Return the number of observations that a student sees.
+
+    Raises:
+        SettingError: If it can't be used.
+    """
+    count = check_count("history", history)
+    if count > 1 and student_obs is not None:
+        raise SettingError(
+            f"history={count} with student_obs=", "one of the two", "leave one of them out"
+        )
+    return count

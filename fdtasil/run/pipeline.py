@@ -11,22 +11,20 @@ from fdtasil.compute import pick_device, torch_settings
 from fdtasil.demonstrations.dataset import Dataset, DatasetLike, load_dataset
 from fdtasil.demonstrations.trainers import Trainer
 from fdtasil.errors import SettingError, heard_warnings
-from fdtasil.experts.carrying import carry
 from fdtasil.experts.examination import check_first, examine
 from fdtasil.experts.expert import Expert
-from fdtasil.experts.gate import GATE_STATES, compare_again, large_batch
-from fdtasil.experts.load import ExpertLike, expert_in, sized
+from fdtasil.experts.gate import GATE_STATES, compare_again
+from fdtasil.experts.load import ExpertLike
 from fdtasil.experts.silence import Silence
 from fdtasil.probes.source import Probes
 from fdtasil.probes.spread import SpreadLike
 from fdtasil.progress import Progress
 from fdtasil.results.distilled import Distilled, write_run
-from fdtasil.results.evaluation import Constraints, Evaluation, check_constraints, evaluate_pair
+from fdtasil.results.evaluation import Constraints, check_constraints, evaluate_pair
 from fdtasil.results.size import size_of_expert, size_of_student
-from fdtasil.rollouts.behaviours import follow, follow_answers
-from fdtasil.rollouts.environments import EnvironmentLike, EnvironmentPool, resolve_horizon
+from fdtasil.rollouts.behaviours import follow
+from fdtasil.rollouts.environments import EnvironmentLike
 from fdtasil.rollouts.episodes import Episodes
-from fdtasil.rollouts.history import past_size
 from fdtasil.run.account import Account
 from fdtasil.run.arguments import read_arguments
 from fdtasil.run.asking import Asking
@@ -38,7 +36,7 @@ from fdtasil.run.doubts import warn_of_idle_weights, warn_of_misfit, warn_of_sil
 from fdtasil.run.events import Callback, Event, tell_all
 from fdtasil.run.folder import asked_anew, open_run_folder
 from fdtasil.run.interrupts import heard_interrupts
-from fdtasil.run.judging import judged_in, judged_through
+from fdtasil.run.judging import check_history
 from fdtasil.run.lesson import Lesson
 from fdtasil.run.report import config_of, no_answer, report_of
 from fdtasil.run.rounds import Rounds
@@ -47,9 +45,9 @@ from fdtasil.run.training import Training
 from fdtasil.seeding import episode_seeds
 from fdtasil.student.architectures import Architecture
 from fdtasil.student.fit import Fit
-from fdtasil.student.view import StudentObservation, View, view_size
+from fdtasil.student.view import StudentObservation
 
-__all__ = ["distill", "evaluate"]
+__all__ = ["distill"]
 
 
 def distill(
@@ -226,97 +224,6 @@ def distill(
                 write_run(result, folder)
                 kept.close()
     return result
-
-
-def evaluate(
-    policy: ExpertLike | Distilled,
-    expert: ExpertLike,
-    env: EnvironmentLike,
-    *,
-    episodes: int = 20,
-    horizon: int | None = None,
-    seed: int = 0,
-    student_obs: StudentObservation | None = None,
-    history: int = 1,
-    constraints: Constraints | None = None,
-    force: bool = False,
-    progress: bool = True,
-) -> Evaluation:
-    """Compare a policy with an expert from the same starts.
-
-    Args:
-        policy: The policy to judge: a result, the folder of a run, a `Student`, an exported ONNX
-            file, or anything else that an expert may be.
-        expert: The policy to judge it by, as in `distill`.
-        env: A gymnasium id (`module:Id` too), a gymnasium environment, or a function making one.
-        episodes: Number of paired episodes.
-        horizon: Steps after which an episode is cut; default: the environment's time limit.
-        seed: Of the starts; those of `distill` with the same seed.
-        student_obs: What the policy sees, as in `distill`; an ONNX file that fdtasil exported
-            says its indices itself.
-        history: As in `distill`.
-        constraints: As in `distill`.
-        force: Go on with a warning where the expert fails the gate but answers.
-        progress: Show progress bars, in a terminal or a notebook.
-
-    Raises:
-        SettingError: If an argument can't be used.
-        ExpertError: If one of the two can't be opened, or the expert fails the gate.
-        EnvironmentFault: If the environment can't be used, or misbehaves.
-
-    Example:
-        >>> import numpy as np
-        >>> def swing(observations):
-        ...     cosine, sine, speed = observations.T
-        ...     return np.clip(-8 * np.arctan2(sine, cosine) - 2 * speed, -2, 2)[:, None]
-        >>> evaluate(swing, swing, "Pendulum-v1", episodes=2, horizon=50).normalized_return
-        1.0
-    """
-    check_count("seed", seed, 0, 2**32 - 1)
-    force = check_flag("force", force)
-    limits = None if constraints is None else check_constraints(constraints)
-    history = check_count("history", history)
-    policy, student_obs, history = judged_through(policy, student_obs, history)
-    history = check_history(history, student_obs)
-    count, bars = check_count("episodes", episodes), Progress(check_flag("progress", progress))
-    with EnvironmentPool(env) as pool, torch_settings(torch.device("cpu")):
-        n, m = pool.boxes.observation_size, pool.boxes.action_size
-        black_box, length = expert_in(expert, pool), resolve_horizon(horizon, pool)
-        student_obs = named(student_obs, pool.spaces.observations)
-        seen_size = view_size(student_obs, n + past_size(history, n, m))
-        judged = judged_in(policy, pool, seen_size, whole=student_obs is None and history == 1)
-        if judged.memory is not None:
-            raise SettingError(
-                f"{judged.name}, which has a memory, to be judged",
-                "a policy without one",
-                "compare it as the expert: evaluate(student, it, env)",
-            )
-        black_box, past, remembered = carry(black_box, pool, history)
-        n += past + remembered
-        starts = episode_seeds(seed, "evaluation", 0, count)
-        most = large_batch(count, black_box.chunk)
-        theirs = examine(black_box, pool, starts, length, bars, force=force, largest=most)
-        student_obs = judged.columns if student_obs is None else student_obs
-        seen = visible(student_obs, n, remembered)
-        view = View.of(seen, theirs.observations[theirs.valid][:256])
-        answer = view.policy(sized(judged, view.size, m).policy("evaluate"))
-        acting = follow_answers(answer)
-        own = n - past - remembered
-        return evaluate_pair(acting, black_box, theirs, pool, length, seed, bars, limits, own)
-
-
-def check_history(history: object, student_obs: object) -> int:
-    """Return the number of observations that a student sees.
-
-    Raises:
-        SettingError: If it can't be used.
-    """
-    count = check_count("history", history)
-    if count > 1 and student_obs is not None:
-        raise SettingError(
-            f"history={count} with student_obs=", "one of the two", "leave one of them out"
-        )
-    return count
 
 
 def _check_nothing_to_step(**asked: object) -> None:

@@ -23,8 +23,9 @@ from fdtasil.results.figures import draw_sizes
 from fdtasil.rollouts.environments import EnvironmentLike
 from fdtasil.rollouts.wanted import Environment, import_module_of
 from fdtasil.run.elsewhere import side_by_side
+from fdtasil.run.evaluating import evaluate
 from fdtasil.run.folder import RunFolder
-from fdtasil.run.pipeline import distill, evaluate
+from fdtasil.run.pipeline import distill
 from fdtasil.student.architectures import Mlp
 from fdtasil.student.fit import Fit
 

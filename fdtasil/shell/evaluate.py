@@ -3,7 +3,7 @@
 from typing import Any
 
 from fdtasil.rollouts.wanted import import_module_of
-from fdtasil.run.pipeline import evaluate
+from fdtasil.run.evaluating import evaluate
 from fdtasil.shell.call import ENVIRONMENT_FLAGS, EXPERT_FLAGS, judged, opened, seen, wanted
 from fdtasil.shell.command import EnvironmentId, Flags, PolicyPath, as_command
 

@@ -1,0 +1,57 @@
+"""What the environments that an agent was trained in make of its observations."""
+
+from collections.abc import Iterator
+from typing import Any
+
+from fdtasil.errors import ExpertError, warn
+
+__all__ = ["normaliser_of"]
+
+# Wrappers of vectorised environments that leave observations and actions as they are.
+_HARMLESS = {"VecMonitor", "VecCheckNan", "VecVideoRecorder", "VecNormalize"}
+
+
+def normaliser_of(source: Any) -> Any:
+    """Return the VecNormalize that normalises an agent's observations, or None.
+
+    Raises:
+        ExpertError: If it was trained on observations that another wrapper made.
+    """
+    if not hasattr(source, "get_vec_normalize_env"):
+        return None
+    found = None
+    for layer in _layers(source.env):
+        kind = type(layer).__name__
+        if kind not in _HARMLESS:
+            raise ExpertError(
+                f"the {type(source).__name__} agent was trained on observations that {kind} makes",
+                "an agent that takes the environment's own observations",
+                "do in the environment what the wrapper does (for VecFrameStack "
+                "FrameStackObservation and FlattenObservation), and pass agent.policy",
+            )
+        if kind == "VecNormalize" and layer.norm_obs:
+            found = layer
+    _check_innermost(source)
+    return found
+
+
+def _layers(outermost: Any) -> Iterator[Any]:
+    """Yield the wrappers around a vectorised environment."""
+    while outermost is not None and "venv" in vars(outermost):
+        yield outermost
+        outermost = outermost.venv
+
+
+def _check_innermost(source: Any) -> None:
+    """Warn of statistics that are kept inside the agent's own environments."""
+    *_, innermost = [source.env, *(layer.venv for layer in _layers(source.env))]
+    layer = next(iter(getattr(innermost, "__dict__", {}).get("envs", ())), None)
+    while layer is not None:
+        if type(layer).__name__ == "NormalizeObservation":
+            warn(
+                f"the {type(source).__name__} agent was trained in NormalizeObservation, whose "
+                "statistics are not the agent's: pass an environment that has them, and keeps "
+                "them as they are (update_running_mean = False)"
+            )
+            return
+        layer = getattr(layer, "__dict__", {}).get("env")

@@ -1,0 +1,132 @@
+"""Objects whose `predict` takes a state and returns the next one."""
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from fdtasil.errors import ExpertError
+from fdtasil.experts.expert import Expert
+from fdtasil.experts.memory import Memory, stateless
+
+__all__ = ["with_state"]
+
+
+def with_state(
+    source: Any, name: str, options: Mapping[str, bool], statistics: Any, observation_size: int
+) -> Expert | None:
+    """Return an object with a memory as an expert, or None where it has none.
+
+    Args:
+        source: Has `predict(observation, state, episode_start)`.
+        name: What to call it.
+        options: What `predict` is called with besides.
+        statistics: The VecNormalize that it was trained in, or None.
+        observation_size: n.
+
+    Raises:
+        ExpertError: If its memory does not begin with zeros.
+    """
+    try:
+        states = [_ask_first(source, rows, observation_size, options) for rows in (2, 3)]
+    except Exception:  # of the user's; the gate will show it
+        return None
+    if any(state is None for state in states):
+        return None
+    axes = [_axis(*parts) for parts in zip(*map(_leaves, states), strict=True)]
+    if None in axes:  # no memory of rows
+        return None
+    step = _Carries(source, statistics, options, states[0], tuple(axis or 0 for axis in axes))
+    memory = Memory(_flat(_leaves(states[0]), step.axes).shape[1], step)
+    _check_start(source, step, memory.size, observation_size, name)
+    n = observation_size
+    return Expert(stateless(step, n), name, n + memory.size, memory=memory)
+
+
+def _check_start(source: Any, step: "_Carries", k: int, n: int, name: str) -> None:
+    """Refuse a memory that does not begin with zeros.
+
+    Raises:
+        ExpertError: If the first answer of an episode is not that to a memory of zeros.
+    """
+    rows = np.random.default_rng(0).standard_normal((2, n)).astype(np.float32)
+    begun = source.predict(rows.copy(), episode_start=np.ones(2, bool), **step.options)[0]
+    zeros, _ = replace(step, statistics=None)(rows.copy(), np.zeros((2, k), np.float32))
+    if not np.allclose(begun, zeros, rtol=1e-3, atol=1e-4):
+        raise ExpertError(
+            f"{name} begins an episode with another memory than zeros",
+            "a memory of zeros at the start",
+            "wrap it: let its state be the difference to the first one",
+        )
+
+
+def _ask_first(source: Any, rows: int, n: int, options: Mapping[str, bool]) -> Any:
+    begun = np.ones(rows, bool)
+    answer = source.predict(np.zeros((rows, n), np.float32), episode_start=begun, **options)
+    return answer[1] if isinstance(answer, tuple) and len(answer) == 2 else None
+
+
+def _leaves(state: Any) -> list[np.ndarray]:
+    """Return the arrays of a state: one, or a tuple or dictionary of them."""
+    if isinstance(state, Mapping):  # by name: in which order they come says nothing
+        state = tuple(state[name] for name in sorted(state))
+    return [np.asarray(part) for part in (state if isinstance(state, tuple | list) else (state,))]
+
+
+def _state_of(parts: list[np.ndarray], like: Any) -> Any:
+    """Return arrays as a state of the same kind, from which `_leaves` returns them."""
+    if isinstance(like, Mapping):
+        return dict(zip(sorted(like), parts, strict=True))
+    return tuple(parts) if isinstance(like, tuple | list) else parts[0]
+
+
+def _axis(two: np.ndarray, three: np.ndarray) -> int | None:
+    """Return which axis of a part is that of rows, from parts for two rows and for three."""
+    if two.ndim != three.ndim:
+        return None
+    axes = (axis for axis in range(two.ndim) if (two.shape[axis], three.shape[axis]) == (2, 3))
+    return next(axes, None)
+
+
+def _flat(parts: list[np.ndarray], axes: tuple[int, ...]) -> np.ndarray:
+    """Return (B, k) of the parts of a state."""
+    moved = [np.moveaxis(part, axis, 0) for part, axis in zip(parts, axes, strict=True)]
+    return np.concatenate([part.reshape(len(part), -1) for part in moved], 1).astype(np.float32)
+
+
+@dataclass(frozen=True)
+class _Carries:
+    """An object's `predict`, with its state as one vector a row.
+
+    Attributes:
+        source: Has `predict(observation, state, episode_start)`.
+        statistics: The VecNormalize that it was trained in, or None.
+        options: What `predict` is called with besides.
+        like: A state, for the kinds and shapes of its parts.
+        axes: Of rows, in each part of a state.
+    """
+
+    source: Any
+    statistics: Any
+    options: Mapping[str, bool]
+    like: Any
+    axes: tuple[int, ...]
+
+    def __call__(
+        self, observations: np.ndarray, memories: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        if self.statistics is not None:
+            observations = self.statistics.normalize_obs(observations)
+        rows, parts, start = len(observations), [], 0
+        for part, axis in zip(_leaves(self.like), self.axes, strict=True):
+            shape = np.moveaxis(part, axis, 0).shape[1:]
+            stop = start + int(np.prod(shape))
+            moved = memories[:, start:stop].reshape(rows, *shape).astype(part.dtype)
+            parts.append(np.ascontiguousarray(np.moveaxis(moved, 0, axis)))
+            start = stop
+        begun, state = np.zeros(rows, bool), _state_of(parts, self.like)
+        actions, after = self.source.predict(
+            observations, state=state, episode_start=begun, **self.options
+        )
+        return actions, _flat(_leaves(after), self.axes)

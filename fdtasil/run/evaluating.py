@@ -1,0 +1,100 @@
+"""A policy beside an expert, from the same starts."""
+
+import torch
+
+from fdtasil.checks import check_count, check_flag
+from fdtasil.compute import torch_settings
+from fdtasil.errors import SettingError
+from fdtasil.experts.carrying import carry
+from fdtasil.experts.examination import examine
+from fdtasil.experts.gate import large_batch
+from fdtasil.experts.load import ExpertLike, expert_in, sized
+from fdtasil.progress import Progress
+from fdtasil.results.distilled import Distilled
+from fdtasil.results.evaluation import Constraints, Evaluation, check_constraints, evaluate_pair
+from fdtasil.rollouts.behaviours import follow_answers
+from fdtasil.rollouts.environments import EnvironmentLike, EnvironmentPool, resolve_horizon
+from fdtasil.rollouts.history import past_size
+from fdtasil.run.judging import check_history, judged_in, judged_through
+from fdtasil.run.subject import named, visible
+from fdtasil.seeding import episode_seeds
+from fdtasil.student.view import StudentObservation, View, view_size
+
+__all__ = ["evaluate"]
+
+
+def evaluate(
+    policy: ExpertLike | Distilled,
+    expert: ExpertLike,
+    env: EnvironmentLike,
+    *,
+    episodes: int = 20,
+    horizon: int | None = None,
+    seed: int = 0,
+    student_obs: StudentObservation | None = None,
+    history: int = 1,
+    constraints: Constraints | None = None,
+    force: bool = False,
+    progress: bool = True,
+) -> Evaluation:
+    """Compare a policy with an expert from the same starts.
+
+    Args:
+        policy: The policy to judge: a result, the folder of a run, a `Student`, an exported ONNX
+            file, or anything else that an expert may be.
+        expert: The policy to judge it by, as in `distill`.
+        env: A gymnasium id (`module:Id` too), a gymnasium environment, or a function making one.
+        episodes: Number of paired episodes.
+        horizon: Steps after which an episode is cut; default: the environment's time limit.
+        seed: Of the starts; those of `distill` with the same seed.
+        student_obs: What the policy sees, as in `distill`; an ONNX file that fdtasil exported
+            says its indices itself.
+        history: As in `distill`.
+        constraints: As in `distill`.
+        force: Go on with a warning where the expert fails the gate but answers.
+        progress: Show progress bars, in a terminal or a notebook.
+
+    Raises:
+        SettingError: If an argument can't be used.
+        ExpertError: If one of the two can't be opened, or the expert fails the gate.
+        EnvironmentFault: If the environment can't be used, or misbehaves.
+
+    Example:
+        >>> import numpy as np
+        >>> def swing(observations):
+        ...     cosine, sine, speed = observations.T
+        ...     return np.clip(-8 * np.arctan2(sine, cosine) - 2 * speed, -2, 2)[:, None]
+        >>> evaluate(swing, swing, "Pendulum-v1", episodes=2, horizon=50).normalized_return
+        1.0
+    """
+    check_count("seed", seed, 0, 2**32 - 1)
+    force = check_flag("force", force)
+    limits = None if constraints is None else check_constraints(constraints)
+    history = check_count("history", history)
+    policy, student_obs, history = judged_through(policy, student_obs, history)
+    history = check_history(history, student_obs)
+    count, bars = check_count("episodes", episodes), Progress(check_flag("progress", progress))
+    with EnvironmentPool(env) as pool, torch_settings(torch.device("cpu")):
+        n, m = pool.boxes.observation_size, pool.boxes.action_size
+        black_box, length = expert_in(expert, pool), resolve_horizon(horizon, pool)
+        student_obs = named(student_obs, pool.spaces.observations)
+        seen_size = view_size(student_obs, n + past_size(history, n, m))
+        judged = judged_in(policy, pool, seen_size, whole=student_obs is None and history == 1)
+        if judged.memory is not None:
+            raise SettingError(
+                f"{judged.name}, which has a memory, to be judged",
+                "a policy without one",
+                "compare it as the expert: evaluate(student, it, env)",
+            )
+        black_box, past, remembered = carry(black_box, pool, history)
+        n += past + remembered
+        starts = episode_seeds(seed, "evaluation", 0, count)
+        most = large_batch(count, black_box.chunk)
+        theirs = examine(black_box, pool, starts, length, bars, force=force, largest=most)
+        student_obs = judged.columns if student_obs is None else student_obs
+        seen = visible(student_obs, n, remembered)
+        view = View.of(seen, theirs.observations[theirs.valid][:256])
+        answer = view.policy(sized(judged, view.size, m).policy("evaluate"))
+        acting = follow_answers(answer)
+        own = n - past - remembered
+        return evaluate_pair(acting, black_box, theirs, pool, length, seed, bars, limits, own)
