@@ -286,6 +286,7 @@ FAULTS = {
         267: "what was distilled by force, and can't be shrunk or diagnosed by force",
         268: "another size than a student on a robot sees",
         269: "a run that has not ended, in the place of a finished one",
+        271: "a student that is judged in another environment than its own",
         270: "trust that does not reach the policy that asks for it",
     },
 }

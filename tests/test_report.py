@@ -4,10 +4,13 @@ import pickle
 import re
 from html.parser import HTMLParser
 
+import gymnasium
+import numpy as np
 import pytest
 from conftest import QUICK, TOY, mlp_onnx
 
 import fdtasil
+from fdtasil.errors import FdtasilWarning
 from fdtasil.results.card import card_of
 from fdtasil.results.page import page_of
 
@@ -130,3 +133,21 @@ def test_the_time_of_an_expert_is_that_of_its_file(tmp_path):
     result = fdtasil.distill(str(mlp_onnx(tmp_path / "e.onnx")), TOY, 2, **QUICK)
     size = result.report["size"]["expert"]
     assert 0 < size["onnx_microseconds"] < size["microseconds"]
+
+
+@pytest.mark.fault(271)
+def test_a_student_that_is_judged_elsewhere_is_noticed(tmp_path):
+    def swing(rows):
+        return np.clip(-8 * np.arctan2(rows[:, 1:2], rows[:, :1]) - 2 * rows[:, 2:], -2, 2)
+
+    gymnasium.register(
+        "Other/Pendulum-v0",
+        entry_point="gymnasium.envs.classic_control:PendulumEnv",
+        max_episode_steps=200,
+    )
+    run = fdtasil.distill(swing, "Pendulum-v1", 2, **QUICK, out=tmp_path / "run")
+    for student in (run, tmp_path / "run"):
+        for judge in (fdtasil.evaluate, fdtasil.diagnose):
+            with pytest.warns(FdtasilWarning, match="distilled in Pendulum-v1, and is judged in"):
+                judge(student, swing, "Other/Pendulum-v0", episodes=2, horizon=20)
+    assert "<pre>" in fdtasil.diagnose(run, swing, "Pendulum-v1", episodes=2)._repr_html_()

@@ -1,5 +1,6 @@
 """Is it trained well enough, and what does the expert forgive: what can be measured of both."""
 
+import html
 from dataclasses import dataclass
 from typing import Any
 
@@ -27,7 +28,12 @@ from fdtasil.rollouts.environments import (
     simulator_warnings,
 )
 from fdtasil.rollouts.rollout import rollout
-from fdtasil.run.judging import judged_in, judged_through
+from fdtasil.run.judging import (
+    finished_run,
+    judged_in,
+    judged_through,
+    warn_of_another_environment,
+)
 from fdtasil.run.subject import visible
 from fdtasil.seeding import episode_seeds, generator
 from fdtasil.student.view import View, view_size
@@ -82,6 +88,9 @@ class Diagnosis:
     def to_json(self) -> dict[str, Any]:
         """Return the diagnosis as plain JSON values; null for what is no number, or infinite."""
         return without_infinities(to_plain(self))[0]
+
+    def _repr_html_(self) -> str:
+        return f"<pre>{html.escape(str(self))}</pre>"
 
     def __str__(self) -> str:
         lines = [*_of_fidelity(self.fidelity), *_of_stability(self.stability)]
@@ -195,12 +204,14 @@ def diagnose(
     count, bars = check_count("episodes", episodes, 2), Progress(check_flag("progress", progress))
     check_count("seed", seed, 0, 2**32 - 1)
     force = check_flag("force", force)
+    student = finished_run(student)
     looked_at, student_obs, history = judged_through(student, None, 1)
     if history > 1:
         raise SettingError(
             f"a student that sees {history} observations", "one that sees one", "see evaluate()"
         )
     with EnvironmentPool(env) as pool, torch_settings(torch.device("cpu")):
+        warn_of_another_environment(student, pool)
         if pool.spaces.actions.choices:
             raise SettingError(
                 f"{pool.name}, whose actions are choices",

@@ -15,7 +15,13 @@ from fdtasil.results.evaluation import Constraints, Evaluation, check_constraint
 from fdtasil.rollouts.behaviours import follow_answers
 from fdtasil.rollouts.environments import EnvironmentLike, EnvironmentPool, resolve_horizon
 from fdtasil.rollouts.history import past_size
-from fdtasil.run.judging import check_history, judged_in, judged_through
+from fdtasil.run.judging import (
+    check_history,
+    finished_run,
+    judged_in,
+    judged_through,
+    warn_of_another_environment,
+)
 from fdtasil.run.subject import named, visible
 from fdtasil.seeding import episode_seeds
 from fdtasil.student.view import StudentObservation, View, view_size
@@ -71,10 +77,12 @@ def evaluate(
     force = check_flag("force", force)
     limits = None if constraints is None else check_constraints(constraints)
     history = check_count("history", history)
+    policy = whole = finished_run(policy)
     policy, student_obs, history = judged_through(policy, student_obs, history)
     history = check_history(history, student_obs)
     count, bars = check_count("episodes", episodes), Progress(check_flag("progress", progress))
     with EnvironmentPool(env) as pool, torch_settings(torch.device("cpu")):
+        warn_of_another_environment(whole, pool)
         n, m = pool.boxes.observation_size, pool.boxes.action_size
         black_box, length = expert_in(expert, pool), resolve_horizon(horizon, pool)
         student_obs = named(student_obs, pool.spaces.observations)

@@ -4,8 +4,10 @@ import os
 from dataclasses import replace
 from pathlib import Path
 
+import gymnasium
+
 from fdtasil.checks import check_count
-from fdtasil.errors import SettingError
+from fdtasil.errors import SettingError, warn
 from fdtasil.experts.expert import Expert, Hints
 from fdtasil.experts.load import ExpertLike, open_expert
 from fdtasil.experts.onnx_expert import said_history
@@ -16,29 +18,51 @@ from fdtasil.rollouts.spaces import Spaces, flat_layout
 from fdtasil.student.policy import Student
 from fdtasil.student.view import StudentObservation, Unseen
 
-__all__ = ["check_history", "judged_in", "judged_through"]
+__all__ = [
+    "check_history",
+    "finished_run",
+    "judged_in",
+    "judged_through",
+    "warn_of_another_environment",
+]
+
+
+def finished_run(policy: ExpertLike | Distilled) -> ExpertLike | Distilled:
+    """Return the result of a run in the place of its folder, and everything else as it is.
+
+    Raises:
+        StorageError: If the folder is a run's, and damaged.
+    """
+    if isinstance(policy, str | Path) and os.path.isfile(Path(policy) / "student.safetensors"):
+        return Distilled.load(policy)
+    return policy
+
+
+def warn_of_another_environment(policy: ExpertLike | Distilled, pool: EnvironmentPool) -> None:
+    """Warn where a run's student is judged elsewhere than it was distilled."""
+    if isinstance(policy, Distilled):
+        names = policy.settings["env"], pool.name
+        if names[0] != names[1] and all(name in gymnasium.registry for name in names):
+            warn(f"the student was distilled in {names[0]}, and is judged in {names[1]}")
 
 
 def judged_through(
     policy: ExpertLike | Distilled, student_obs: StudentObservation | None, history: int
 ) -> tuple[ExpertLike, StudentObservation | None, int]:
-    """Return a policy with what it sees; a result, a run's folder and its ONNX file say it.
+    """Return a policy with what it sees; a result and a run's ONNX file say it.
 
     Args:
-        policy: The policy; a run's folder stands for its student.
+        policy: The policy, from `finished_run`.
         student_obs: What the caller says that it sees, or None.
         history: How many observations the caller says that it sees.
 
     Raises:
-        StorageError: If the folder is a run's, and damaged.
         SettingError: If it is None, or sees through a function that is lost.
     """
     if policy is None:
         raise SettingError(
             "None in the place of the policy to judge", "a result, a file, a function", "pass one"
         )
-    if isinstance(policy, str | Path) and os.path.isfile(Path(policy) / "student.safetensors"):
-        policy = Distilled.load(policy)
     if isinstance(policy, Distilled):
         history = max(history, policy.steps_seen)
         if history == 1 and student_obs is None and not policy.view.is_whole:
