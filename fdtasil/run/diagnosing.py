@@ -211,7 +211,6 @@ def diagnose(
             f"a student that sees {history} observations", "one that sees one", "see evaluate()"
         )
     with EnvironmentPool(env) as pool, torch_settings(torch.device("cpu")):
-        warn_of_another_environment(student, pool)
         if pool.spaces.actions.choices:
             raise SettingError(
                 f"{pool.name}, whose actions are choices",
@@ -231,6 +230,7 @@ def diagnose(
         seen = judged.columns if student_obs is None else student_obs
         view = View.of(visible(seen, n, 0), visited[:256])
         act = view.policy(sized(judged, view.size, pool.boxes.action_size).policy("check"))
+        warn_of_another_environment(student, pool)
         scales, boxes = measure_scales(visited), pool.boxes
         held = pool.spaces.observations.held
         if not np.delete(scales.probed("whitened"), list(held)).any():

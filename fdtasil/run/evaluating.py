@@ -82,7 +82,6 @@ def evaluate(
     history = check_history(history, student_obs)
     count, bars = check_count("episodes", episodes), Progress(check_flag("progress", progress))
     with EnvironmentPool(env) as pool, torch_settings(torch.device("cpu")):
-        warn_of_another_environment(whole, pool)
         n, m = pool.boxes.observation_size, pool.boxes.action_size
         black_box, length = expert_in(expert, pool), resolve_horizon(horizon, pool)
         student_obs = named(student_obs, pool.spaces.observations)
@@ -103,6 +102,7 @@ def evaluate(
         seen = visible(student_obs, n, remembered)
         view = View.of(seen, theirs.observations[theirs.valid][:256])
         answer = view.policy(sized(judged, view.size, m).policy("evaluate"))
+        warn_of_another_environment(whole, pool)
         acting = follow_answers(answer)
         own = n - past - remembered
         return evaluate_pair(acting, black_box, theirs, pool, length, seed, bars, limits, own)
