@@ -350,6 +350,7 @@ def test_a_run_goes_on_where_it_was_begun_or_where_it_is_told_to(inside, tmp_pat
 # --- surroundings
 
 
+@pytest.mark.slow
 def test_a_module_of_the_current_folder_and_a_warning_without_source(expert, tmp_path):
     """As the installed command, which does not look into the current folder by itself."""
     (tmp_path / "mine.py").write_text(

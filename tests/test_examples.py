@@ -50,6 +50,7 @@ def cart_pole(monkeypatch):
 
 @pytest.mark.usefixtures("no_pictures")
 @pytest.mark.filterwarnings("ignore::fdtasil.FdtasilWarning")
+@pytest.mark.slow
 def test_a_planner_with_hard_limits(cart_pole):
     rest, lost = np.zeros(4), np.array([0.99, 0.0, 2.0, 0.0])  # too fast for what is left of it
     answers = cart_pole.controller(np.stack([rest, lost]))

@@ -186,6 +186,7 @@ print(len(found.candidates))
     assert done.stdout.split() == ["begun", "2"], done.stderr
 
 
+@pytest.mark.slow
 def test_a_failure_side_by_side_ends_the_others():
     begun = time.monotonic()
     with pytest.raises(SettingError, match="the first"):
