@@ -71,7 +71,6 @@ def run(cell: Cell, device: str) -> dict[str, Any]:
         env,
         keep=KEEP,
         sizes=sizes,
-        seed=cell["seed"],
         fit=fdtasil.Fit(steps=STEPS),
         progress=False,
     )

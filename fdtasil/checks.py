@@ -137,7 +137,7 @@ def check_suffix(path: Path, *suffixes: str) -> Path:
     if path.suffix.lower() in suffixes:
         return path
     listed = " or ".join(suffixes)
-    advice = f"write {path.with_suffix(suffixes[0]).name}"
+    advice = f"write {path.stem or 'file'}{suffixes[0]}"  # a folder has no name of a file
     raise SettingError(f"the file {path.name!r}", f"a name that ends with {listed}", advice)
 
 

@@ -127,6 +127,9 @@ def test_files_whose_names_say_something_else_are_not_written(quick_folder, insi
     assert done.returncode == 2
     assert "write r.html" in done.stderr
     assert not (tmp_path / "r.pdf").exists()
+    done = inside("report", quick_folder, "--out", ".")
+    assert done.returncode == 2
+    assert "write file.html" in done.stderr
 
 
 def test_the_time_of_an_expert_is_that_of_its_file(tmp_path):

@@ -55,9 +55,10 @@ class Diagnosis:
         largest_error: Largest error of the student on its own paths, in units of half an action's
             range, where the expert has an answer.
         disturbed: How far disturbances of the expert led that were as large, in deviations; None
-            where none were.
+            where none were, or the student makes no error.
         by_law: gamma(largest_error): how far that leads by the measured law; None where no law was
-            found. Both are lower estimates of what can happen, and no bounds.
+            found, or the student makes no error. Both are lower estimates of what can happen, and
+            no bounds.
         gap: How far it did lead: largest distance of the two paths of any episode.
         ended: Of how many episodes the student's path ended before the expert's: their distance
             is at least what was seen.

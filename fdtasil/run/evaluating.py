@@ -77,8 +77,8 @@ def evaluate(
     force = check_flag("force", force)
     limits = None if constraints is None else check_constraints(constraints)
     history = check_count("history", history)
-    policy = whole = finished_run(policy)
-    policy, student_obs, history = judged_through(policy, student_obs, history)
+    policy = finished_run(policy)
+    looked_at, student_obs, history = judged_through(policy, student_obs, history)
     history = check_history(history, student_obs)
     count, bars = check_count("episodes", episodes), Progress(check_flag("progress", progress))
     with EnvironmentPool(env) as pool, torch_settings(torch.device("cpu")):
@@ -86,7 +86,7 @@ def evaluate(
         black_box, length = expert_in(expert, pool), resolve_horizon(horizon, pool)
         student_obs = named(student_obs, pool.spaces.observations)
         seen_size = view_size(student_obs, n + past_size(history, n, m))
-        judged = judged_in(policy, pool, seen_size, whole=student_obs is None and history == 1)
+        judged = judged_in(looked_at, pool, seen_size, whole=student_obs is None and history == 1)
         if judged.memory is not None:
             raise SettingError(
                 f"{judged.name}, which has a memory, to be judged",
@@ -102,7 +102,7 @@ def evaluate(
         seen = visible(student_obs, n, remembered)
         view = View.of(seen, theirs.observations[theirs.valid][:256])
         answer = view.policy(sized(judged, view.size, m).policy("evaluate"))
-        warn_of_another_environment(whole, pool)
+        warn_of_another_environment(policy, pool)
         acting = follow_answers(answer)
         own = n - past - remembered
         return evaluate_pair(acting, black_box, theirs, pool, length, seed, bars, limits, own)

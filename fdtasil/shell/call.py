@@ -53,14 +53,14 @@ EXPERT_FLAGS = Flags(load_expert, only=("output", "inputs", "trust"), types={"in
 
 
 def wanted(
-    env: str | None, env_kwargs: str | None, reset_options: str | None, num_envs: int = 0
-) -> Environment | str | None:
+    env: str, env_kwargs: str | None, reset_options: str | None, num_envs: int = 0
+) -> Environment | str:
     """Return an environment that is made and reset as flags say; its id, where they say nothing.
 
     Raises:
         SettingError: If a text is no JSON object.
     """
-    if env is None or not (env_kwargs or reset_options or num_envs):
+    if not (env_kwargs or reset_options or num_envs):
         return env
     kwargs, options = _object("env_kwargs", env_kwargs), _object("reset_options", reset_options)
     return Environment(env, kwargs, options, num_envs)
@@ -103,9 +103,12 @@ def distil(arguments: Arguments, *, progress: bool = True) -> Distilled:
     output, inputs, trust = (rest.pop(name) for name in ("output", "inputs", "trust"))
     formats = rest.pop("log_formats")
     rest["student_obs"] = seen(rest.get("student_obs"))
-    made = (rest.pop(name, usual) for name, (_, usual, _) in ENVIRONMENT_FLAGS.items())
-    rest["env"] = wanted(rest["env"], *made)
-    rest["expert"] = opened(rest["expert"], rest["env"], output=output, inputs=inputs, trust=trust)
+    made = [rest.pop(name, usual) for name, (_, usual, _) in ENVIRONMENT_FLAGS.items()]
+    if rest["env"] is not None:
+        rest["env"] = wanted(rest["env"], *made)
+    if rest["expert"] is not None:
+        how = {"output": output, "inputs": inputs, "trust": trust}
+        rest["expert"] = opened(rest["expert"], rest["env"], **how)
     folder = Path(rest["out"] or rest["resume"] or ".")
     return distill(
         **rest,
@@ -131,19 +134,19 @@ def judged(policy: str, trust: Any) -> ExpertLike:
 
 
 def opened(
-    expert: str | None,
+    expert: str,
     env: Environment | str | None,
     *,
     output: str | None,
     inputs: str | None,
     trust: Any,
-) -> ExpertLike | None:
+) -> ExpertLike:
     """Return an expert opened with options; as it is, where there are none.
 
     Raises:
         ExpertError: If it can't be opened.
     """
-    if expert is None or (output is None and inputs is None and trust is None):
+    if output is None and inputs is None and trust is None:
         return expert
     if env is None:
         return load_expert(expert, output=output, inputs=inputs, trust=trust)

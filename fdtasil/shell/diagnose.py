@@ -23,9 +23,7 @@ def _diagnose(
 ) -> None:
     import_module_of(env)
     place = wanted(env, env_kwargs, reset_options)
-    assert place is not None
     asked = opened(expert, place, output=output, inputs=inputs, trust=trust)
-    assert asked is not None
     print(diagnose(judged(student, trust), asked, place, **arguments))
 
 

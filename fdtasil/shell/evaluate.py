@@ -21,9 +21,7 @@ def _evaluate(
 ) -> None:
     import_module_of(env)
     place = wanted(env, *(arguments.pop(name) for name in ENVIRONMENT_FLAGS))
-    assert place is not None
     judge = opened(expert, place, output=output, inputs=inputs, trust=trust)
-    assert judge is not None
     arguments["student_obs"] = seen(arguments["student_obs"])
     print(evaluate(judged(policy, trust), expert=judge, env=place, **arguments))
 

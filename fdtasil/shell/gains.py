@@ -56,8 +56,6 @@ def command(
     import_module_of(env)
     place = wanted(env, env_kwargs, reset_options)
     source = opened(expert, place, output=output, inputs=inputs, trust=trust)
-    assert source is not None
-    assert place is not None
     with EnvironmentPool(place) as pool:
         looked = look_closely(source, pool, horizon, seed, 1, with_chance=False)
         problem = next((f.problem for f in looked.findings if f.problem), None)

@@ -60,8 +60,6 @@ def command(
     import_module_of(env)
     place = wanted(env, env_kwargs, reset_options)
     source = opened(expert, place, output=output, inputs=inputs, trust=trust)
-    assert source is not None
-    assert place is not None
     with EnvironmentPool(place) as pool:
         looked = look_closely(source, pool, horizon, seed, episodes)
         rows = [

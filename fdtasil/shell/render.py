@@ -39,7 +39,6 @@ def _render(
     file = out.absolute()  # an environment may change the folder
     import_module_of(env)
     place = wanted(env, env_kwargs, reset_options)
-    assert place is not None
     render(named, place, file, **arguments)
     print(f"written: {out}")
 

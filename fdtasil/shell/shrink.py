@@ -39,9 +39,7 @@ def _shrink(
     place_of_runs = run.parent / f"{run.name}-shrunk" if out is None else out
     import_module_of(env)
     place = wanted(env, env_kwargs, reset_options)
-    assert place is not None
     asked = opened(expert, place, output=output, inputs=inputs, trust=trust)
-    assert asked is not None
     found = shrink(
         run,
         asked,
