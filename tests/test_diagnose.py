@@ -446,6 +446,18 @@ def test_the_linearised_loop_is_the_simulators_own():
     assert "linearised loops" in str(found)
 
 
+def test_a_policy_that_feels_contacts_has_a_linearised_loop_with_them():
+    """Contact forces are observed on the moved state, as after a step, not as they last were."""
+
+    def feels(rows):
+        return 1e-3 * np.asarray(rows)[:, 27:].sum(axis=1, keepdims=True) * np.ones(8, np.float32)
+
+    still = lambda rows: np.zeros((len(rows), 8), np.float32)  # noqa: E731
+    unclipped = fdtasil.Environment("Ant-v5", kwargs={"contact_force_range": (-1e6, 1e6)})
+    found = fdtasil.diagnose(feels, still, unclipped, episodes=2, horizon=40).linearisation
+    assert np.max(np.abs(np.subtract(found.student, found.expert))) > 0.1
+
+
 def test_what_is_no_such_simulator_has_no_linearised_loop():
     found = fdtasil.diagnose(rest, rest, lambda: PowerLaw(1.0), episodes=2, horizon=20)
     assert found.linearisation is None

@@ -108,7 +108,7 @@ def test_another_configuration_is_refused_with_the_difference(expert, tmp_path):
         SettingError, match=r"fit\.weight_decay was 0\.01, is 0\.5; seed was 0, is 4"
     ):
         fdtasil.distill(expert, TOY, resume=tmp_path / "run", **other)
-    with pytest.raises(SettingError, match="unfinished run"):
+    with pytest.raises(SettingError, match="not ended"):
         fdtasil.distill(expert, TOY, out=tmp_path / "run", **RUN)
     with pytest.raises(SettingError, match="no run to resume"):
         fdtasil.distill(expert, TOY, resume=tmp_path / "nothing", **RUN)

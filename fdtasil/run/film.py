@@ -13,7 +13,7 @@ import gymnasium
 import numpy as np
 from PIL import Image, ImageDraw, ImageFont
 
-from fdtasil.checks import check_count, check_path
+from fdtasil.checks import check_count, check_path, check_suffix
 from fdtasil.errors import EnvironmentFault, ExportError, SettingError, first_line
 from fdtasil.experts.carrying import carry
 from fdtasil.experts.load import ExpertLike, sized
@@ -69,11 +69,7 @@ def render(
 
         fdtasil.render({"expert": "expert.onnx", "student": "student.onnx"}, "Ant-v5", "film.mp4")
     """
-    path = check_path("out", out).absolute()
-    if path.suffix not in _WRITERS:
-        raise SettingError(
-            f"out={str(out)!r}", f"a name that ends with {' or '.join(_WRITERS)}", "write film.mp4"
-        )
+    path = check_suffix(check_path("out", out), *_WRITERS).absolute()
     if not isinstance(policies, Mapping) or not policies:
         found = f"policies is a {type(policies).__name__}" if policies else "no policies"
         raise SettingError(found, "names with policies", 'write {"student": student}')
@@ -92,7 +88,7 @@ def render(
         bar.lengthen(len(range(0, steps, every)))
         pictures = _pictures(players, steps, every, height, bar.move)
         fps = players[0].fps / every
-        write_bytes(path, _WRITERS[path.suffix](pictures, fps))
+        write_bytes(path, _WRITERS[path.suffix.lower()](pictures, fps))
     return Path(out)
 
 

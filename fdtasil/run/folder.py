@@ -71,7 +71,7 @@ def open_run_folder(
         elif folder.begun:
             _read_config(path)  # of another format, it can't be gone on with
             raise SettingError(
-                f"{path} holds an unfinished run",
+                f"{path} holds a run that has not ended",
                 "an empty folder, or a finished run (which is replaced)",
                 f"{going_on}, or choose another folder",
             )
