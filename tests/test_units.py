@@ -15,7 +15,7 @@ from fdtasil.errors import EnvironmentFault, FdtasilWarning
 from fdtasil.files.onnx.export import export_module
 from fdtasil.probes.scales import measure_scales
 from fdtasil.progress import Progress
-from fdtasil.results.evaluation import evaluate_pair
+from fdtasil.results.pair import evaluate_pair
 from fdtasil.rollouts.behaviours import follow
 from fdtasil.rollouts.environments import EnvironmentPool
 from fdtasil.rollouts.rollout import rollout

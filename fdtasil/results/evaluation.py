@@ -1,43 +1,13 @@
-"""Paired evaluation: student and expert from the same starts, with an interval."""
+"""What a paired evaluation found, and how it is told."""
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from typing import Any
 
-import numpy as np
-
-from fdtasil.checks import spelt
-from fdtasil.errors import SettingError, first_line, warn
-from fdtasil.experts.expert import Expert
 from fdtasil.files.plain import from_plain, to_plain
-from fdtasil.probes.scales import measure_scales
-from fdtasil.progress import Progress
-from fdtasil.results.smoothness import smoothness_of
-from fdtasil.results.stability import distances
-from fdtasil.rollouts.behaviours import Behaviour, has_none, random_behaviour
-from fdtasil.rollouts.environments import EnvironmentPool
-from fdtasil.rollouts.episodes import Episodes
-from fdtasil.rollouts.rollout import rollout
-from fdtasil.rollouts.spaces import Layout
-from fdtasil.seeding import generator
 
-__all__ = [
-    "Constraints",
-    "Evaluation",
-    "check_constraints",
-    "evaluate_pair",
-    "evaluation_rows",
-    "interval_text",
-    "rows_html",
-    "score_text",
-]
-
-Constraints = Mapping[str, Callable[[np.ndarray, np.ndarray], np.ndarray]]
-"""Name -> function of (N, n) observations and the (N, m) actions taken there: (N,) numbers,
-positive where the constraint is violated."""
-
-_RESAMPLES = 2000
+__all__ = ["Evaluation", "evaluation_rows", "interval_text", "rows_html", "score_text"]
 
 
 @dataclass(frozen=True)
@@ -170,152 +140,6 @@ def evaluation_rows(found: Evaluation) -> list[tuple[str, str]]:
     return rows
 
 
-def evaluate_pair(
-    student: Behaviour,
-    expert: Expert,
-    expert_episodes: Episodes,
-    pool: EnvironmentPool,
-    horizon: int,
-    seed: int,
-    progress: Progress,
-    constraints: Constraints | None = None,
-    own: int | None = None,
-) -> Evaluation:
-    """Run a policy from the starts of the expert's episodes, and compare.
-
-    Args:
-        student: Who acts.
-        expert: Answers on the student's states, counted under "evaluate".
-        expert_episodes: (E, T) the expert's own, already recorded.
-        pool: The environment.
-        horizon: T.
-        seed: Of the bootstrap, and of the random actions where they are the reference.
-        progress: Progress bars.
-        constraints: What is counted where it is violated.
-        own: Length of the environment's own observations, which constraints are functions of; the
-            whole of them if left out.
-    """
-    broken = {
-        name: _violated(name, constraint, expert_episodes, pool, own)  # before hours of steps
-        for name, constraint in (constraints or {}).items()
-    }
-    seeds = [int(s) for s in expert_episodes.seeds]
-    with progress.bar("evaluation", "step", len(seeds) * horizon) as bar:
-        student_episodes = rollout(student, pool, seeds, horizon, on_step=bar.move)
-    reference = _reference_return(expert_episodes, pool, seeds, horizon, seed)
-    ours, theirs = student_episodes.returns, expert_episodes.returns
-    meaningful = float(theirs.mean()) > reference
-    if not meaningful:
-        least = "0" if np.median(theirs) > 0 else f"{reference:.4g}, that of random actions"
-        warn(
-            f"the expert's return {theirs.mean():.4g} is not above {least}: no normalised return; "
-            "check that expert and environment belong together"
-        )
-    for who, episodes in (("expert", expert_episodes), ("policy", student_episodes)):
-        if episodes.given_up.any():
-            warn(
-                f"{episodes.given_up.sum()} of {len(seeds)} episodes of the {who} were ended, "
-                "for it had no answer for long; their returns are of shorter episodes"
-            )
-    reset = student_episodes.physics_resets > 0
-    if reset.mean() > 0.5:  # more than one start each: not the returns of this policy
-        meaningful = False
-    visited = student_episodes.observations[student_episodes.valid]
-    acted = student_episodes.actions[student_episodes.valid]
-    said = expert.ask(visited, "evaluate")
-    heard = ~has_none(said)  # where the expert has an answer
-    distance = np.linalg.norm(acted[heard] - said[heard], axis=1)
-    our_smoothness = smoothness_of(student_episodes, pool)
-    their_smoothness = smoothness_of(expert_episodes, pool)
-    return Evaluation(
-        episodes=len(seeds),
-        horizon=horizon,
-        expert_return=float(theirs.mean()),
-        student_return=float(ours.mean()),
-        reference_return=reference,
-        normalized_return=_share(ours - reference, theirs - reference) if meaningful else None,
-        ci95=_interval(ours - reference, theirs - reference, seed) if meaningful else None,
-        survival=_survival(student_episodes),
-        expert_survival=_survival(expert_episodes),
-        action_error=float(distance.mean()) if len(distance) else float("nan"),
-        imitation_gap=_imitation_gap(student_episodes, expert_episodes),
-        expert_returns=tuple(theirs.tolist()),
-        student_returns=tuple(ours.tolist()),
-        expert_physics_resets=int((expert_episodes.physics_resets > 0).sum()),
-        physics_resets=int(reset.sum()),
-        violations=tuple(
-            (name, broken[name], _violated(name, constraint, student_episodes, pool, own))
-            for name, constraint in (constraints or {}).items()
-        ),
-        agreement=_agreement(pool.spaces.actions, acted[heard], said[heard]),
-        roughness=our_smoothness.roughness,
-        expert_roughness=their_smoothness.roughness,
-        high_frequency=our_smoothness.high_frequency,
-        expert_high_frequency=their_smoothness.high_frequency,
-    )
-
-
-def _agreement(actions: Layout, ours: np.ndarray, theirs: np.ndarray) -> float | None:
-    """Return the share of the rows whose choices are all the same."""
-    if not actions.choices or not len(ours):
-        return None
-    return float((actions.best(ours) == actions.best(theirs)).all(axis=1).mean())
-
-
-def _survival(episodes: Episodes) -> float:
-    """Return the share of the episodes that nothing ended before their time."""
-    return float(1 - (episodes.terminated | episodes.given_up).mean())
-
-
-def check_constraints(constraints: object) -> Constraints:
-    """Refuse what are no constraints.
-
-    Raises:
-        SettingError: If they are something else.
-    """
-    good = isinstance(constraints, Mapping) and all(
-        isinstance(name, str) and callable(one) for name, one in constraints.items()
-    )
-    if not good:
-        raise SettingError(spelt("constraints", constraints), _CONSTRAINTS, _LIMIT)
-    return constraints  # pyright: ignore[reportReturnType]
-
-
-_CONSTRAINTS = "names, each with a function of (N, n) observations and (N, m) actions"
-_LIMIT = 'write for example constraints={"rail": lambda x, u: abs(x[:, 0]) - 1}'
-
-
-def _violated(
-    name: str,
-    constraint: Callable[[np.ndarray, np.ndarray], np.ndarray],
-    episodes: Episodes,
-    pool: EnvironmentPool,
-    own: int | None,
-) -> float:
-    """Return the share of the steps at which a constraint is violated."""
-    states = episodes.observations[episodes.valid][:, :own]
-    actions, _ = pool.bounds.put_inside(episodes.actions[episodes.valid])
-    try:
-        found = np.asarray(constraint(states.copy(), actions.copy()), np.float64)
-    except Exception as error:
-        said = f"constraints: {name!r} raised {type(error).__name__}: {first_line(error)}"
-        raise SettingError(said, _CONSTRAINTS, _LIMIT) from error
-    if found.shape != (len(states),) or np.isnan(found).any():
-        nan = "NaN in " if np.isnan(found).any() else ""
-        said = f"constraints: {name!r} returned {nan}shape {found.shape}"
-        raise SettingError(said, f"({len(states)},) numbers, positive where violated", _LIMIT)
-    return float((found > 0).mean())
-
-
-def _reference_return(
-    expert: Episodes, pool: EnvironmentPool, seeds: list[int], horizon: int, seed: int
-) -> float:
-    if np.median(expert.returns) > 0:
-        return 0.0
-    noise = [generator(seed, "random actions", episode) for episode in range(len(seeds))]
-    return float(rollout(random_behaviour(pool), pool, seeds, horizon, noise).returns.mean())
-
-
 def score_text(share: float | None) -> str:
     """Return a normalised return for a table."""
     return "n/a" if share is None else f"{share:.3f}"
@@ -324,35 +148,3 @@ def score_text(share: float | None) -> str:
 def interval_text(interval: tuple[float, float] | None) -> str:
     """Return an interval for a table."""
     return "n/a" if interval is None else f"[{interval[0]:.3f}, {interval[1]:.3f}]"
-
-
-def _share(ours: np.ndarray, theirs: np.ndarray) -> float:
-    return float(ours.mean() / theirs.mean())
-
-
-def _interval(ours: np.ndarray, theirs: np.ndarray, seed: int) -> tuple[float, float] | None:
-    from scipy import stats  # loads for most of a second, and many runs end before it
-
-    def ratio(a: np.ndarray, b: np.ndarray, axis: int = -1) -> np.ndarray:
-        return a.mean(axis=axis) / b.mean(axis=axis)
-
-    if len(ours) < 2:
-        return None
-    if np.array_equal(ours * theirs[0], theirs * ours[0]):  # one ratio for all: nothing to draw
-        point = _share(ours, theirs)
-        return point, point
-    result = stats.bootstrap(
-        (ours, theirs),
-        ratio,
-        paired=True,
-        vectorized=True,
-        method="percentile",
-        n_resamples=_RESAMPLES,
-        rng=generator(seed, "bootstrap"),
-    )
-    return float(result.confidence_interval.low), float(result.confidence_interval.high)
-
-
-def _imitation_gap(student: Episodes, expert: Episodes) -> float:
-    scales = measure_scales(expert.observations[expert.valid])
-    return float(distances(expert, student, scales).mean())

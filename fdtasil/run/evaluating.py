@@ -10,8 +10,10 @@ from fdtasil.experts.examination import examine
 from fdtasil.experts.gate import large_batch
 from fdtasil.experts.load import ExpertLike, expert_in, sized
 from fdtasil.progress import Progress
+from fdtasil.results.constraints import Constraints, check_constraints
 from fdtasil.results.distilled import Distilled
-from fdtasil.results.evaluation import Constraints, Evaluation, check_constraints, evaluate_pair
+from fdtasil.results.evaluation import Evaluation
+from fdtasil.results.pair import evaluate_pair
 from fdtasil.rollouts.behaviours import follow_answers
 from fdtasil.rollouts.environments import EnvironmentLike, EnvironmentPool, resolve_horizon
 from fdtasil.rollouts.history import past_size

@@ -19,8 +19,9 @@ from fdtasil.experts.silence import Silence
 from fdtasil.probes.source import Probes
 from fdtasil.probes.spread import SpreadLike
 from fdtasil.progress import Progress
+from fdtasil.results.constraints import Constraints, check_constraints
 from fdtasil.results.distilled import Distilled, write_run
-from fdtasil.results.evaluation import Constraints, check_constraints, evaluate_pair
+from fdtasil.results.pair import evaluate_pair
 from fdtasil.results.size import size_of_expert, size_of_student
 from fdtasil.rollouts.behaviours import follow
 from fdtasil.rollouts.environments import EnvironmentLike

@@ -1,0 +1,171 @@
+"""Paired evaluation: student and expert from the same starts, with an interval."""
+
+import numpy as np
+
+from fdtasil.errors import warn
+from fdtasil.experts.expert import Expert
+from fdtasil.probes.scales import measure_scales
+from fdtasil.progress import Progress
+from fdtasil.results.constraints import Constraints, violated
+from fdtasil.results.evaluation import Evaluation
+from fdtasil.results.smoothness import smoothness_of
+from fdtasil.results.stability import distances
+from fdtasil.rollouts.behaviours import Behaviour, has_none, random_behaviour
+from fdtasil.rollouts.environments import EnvironmentPool
+from fdtasil.rollouts.episodes import Episodes
+from fdtasil.rollouts.rollout import rollout
+from fdtasil.seeding import generator
+
+__all__ = ["evaluate_pair"]
+
+_RESAMPLES = 2000
+
+
+def evaluate_pair(
+    student: Behaviour,
+    expert: Expert,
+    expert_episodes: Episodes,
+    pool: EnvironmentPool,
+    horizon: int,
+    seed: int,
+    progress: Progress,
+    constraints: Constraints | None = None,
+    own: int | None = None,
+) -> Evaluation:
+    """Run a policy from the starts of the expert's episodes, and compare.
+
+    Args:
+        student: Who acts.
+        expert: Answers on the student's states, counted under "evaluate".
+        expert_episodes: (E, T) the expert's own, already recorded.
+        pool: The environment.
+        horizon: T.
+        seed: Of the bootstrap, and of the random actions where they are the reference.
+        progress: Progress bars.
+        constraints: What is counted where it is violated.
+        own: Length of the environment's own observations, which constraints are functions of; the
+            whole of them if left out.
+    """
+    limits = constraints or {}
+    broken = violated(limits, expert_episodes, pool, own)  # before hours of steps
+    seeds = [int(s) for s in expert_episodes.seeds]
+    with progress.bar("evaluation", "step", len(seeds) * horizon) as bar:
+        student_episodes = rollout(student, pool, seeds, horizon, on_step=bar.move)
+    reference = _reference_return(expert_episodes, pool, seeds, horizon, seed)
+    ours, theirs = student_episodes.returns, expert_episodes.returns
+    _warn(expert_episodes, student_episodes, reference)
+    reset = student_episodes.physics_resets > 0
+    # A reset in most episodes: more than one start each, not the returns of this policy.
+    meaningful = float(theirs.mean()) > reference and reset.mean() <= 0.5
+    error, agreement = _nearness(student_episodes, expert, pool)
+    our_violations = violated(limits, student_episodes, pool, own)
+    our_smoothness = smoothness_of(student_episodes, pool)
+    their_smoothness = smoothness_of(expert_episodes, pool)
+    return Evaluation(
+        episodes=len(seeds),
+        horizon=horizon,
+        expert_return=float(theirs.mean()),
+        student_return=float(ours.mean()),
+        reference_return=reference,
+        normalized_return=_share(ours - reference, theirs - reference) if meaningful else None,
+        ci95=_interval(ours - reference, theirs - reference, seed) if meaningful else None,
+        survival=_survival(student_episodes),
+        expert_survival=_survival(expert_episodes),
+        action_error=error,
+        imitation_gap=_imitation_gap(student_episodes, expert_episodes),
+        expert_returns=tuple(theirs.tolist()),
+        student_returns=tuple(ours.tolist()),
+        expert_physics_resets=int((expert_episodes.physics_resets > 0).sum()),
+        physics_resets=int(reset.sum()),
+        violations=tuple((name, broken[name], our_violations[name]) for name in limits),
+        agreement=agreement,
+        roughness=our_smoothness.roughness,
+        expert_roughness=their_smoothness.roughness,
+        high_frequency=our_smoothness.high_frequency,
+        expert_high_frequency=their_smoothness.high_frequency,
+    )
+
+
+def _warn(expert: Episodes, student: Episodes, reference: float) -> None:
+    """Warn of returns that mean less than they seem to."""
+    mean = expert.returns.mean()
+    if mean <= reference:
+        chance = "" if np.median(expert.returns) > 0 else ", that of random actions"
+        warn(
+            f"the expert's return {mean:.4g} is not above {reference:.4g}{chance}: no normalised "
+            "return; check that expert and environment belong together"
+        )
+    for who, episodes in (("expert", expert), ("policy", student)):
+        ended = episodes.given_up
+        if ended.any():
+            warn(
+                f"{ended.sum()} of {len(ended)} episodes of the {who} were ended, for it had no "
+                "answer for long; their returns are of shorter episodes"
+            )
+
+
+def _nearness(
+    student: Episodes, expert: Expert, pool: EnvironmentPool
+) -> tuple[float, float | None]:
+    """Ask the expert on the student's own states.
+
+    Returns:
+        The mean distance of the actions, NaN where the expert has no answer anywhere; and, where
+        actions are choices, the share of the rows whose choices are all the same.
+    """
+    acted = student.actions[student.valid]
+    said = expert.ask(student.observations[student.valid], "evaluate")
+    heard = ~has_none(said)  # where the expert has an answer
+    acted, said, layout = acted[heard], said[heard], pool.spaces.actions
+    if not len(said):
+        return float("nan"), None
+    distance = float(np.linalg.norm(acted - said, axis=1).mean())
+    if not layout.choices:
+        return distance, None
+    return distance, float((layout.best(acted) == layout.best(said)).all(axis=1).mean())
+
+
+def _survival(episodes: Episodes) -> float:
+    """Return the share of the episodes that nothing ended before their time."""
+    return float(1 - (episodes.terminated | episodes.given_up).mean())
+
+
+def _reference_return(
+    expert: Episodes, pool: EnvironmentPool, seeds: list[int], horizon: int, seed: int
+) -> float:
+    if np.median(expert.returns) > 0:
+        return 0.0
+    noise = [generator(seed, "random actions", episode) for episode in range(len(seeds))]
+    return float(rollout(random_behaviour(pool), pool, seeds, horizon, noise).returns.mean())
+
+
+def _share(ours: np.ndarray, theirs: np.ndarray) -> float:
+    return float(ours.mean() / theirs.mean())
+
+
+def _interval(ours: np.ndarray, theirs: np.ndarray, seed: int) -> tuple[float, float] | None:
+    from scipy import stats  # loads for most of a second, and many runs end before it
+
+    def ratio(a: np.ndarray, b: np.ndarray, axis: int = -1) -> np.ndarray:
+        return a.mean(axis=axis) / b.mean(axis=axis)
+
+    if len(ours) < 2:
+        return None
+    if np.array_equal(ours * theirs[0], theirs * ours[0]):  # one ratio for all: nothing to draw
+        point = _share(ours, theirs)
+        return point, point
+    result = stats.bootstrap(
+        (ours, theirs),
+        ratio,
+        paired=True,
+        vectorized=True,
+        method="percentile",
+        n_resamples=_RESAMPLES,
+        rng=generator(seed, "bootstrap"),
+    )
+    return float(result.confidence_interval.low), float(result.confidence_interval.high)
+
+
+def _imitation_gap(student: Episodes, expert: Episodes) -> float:
+    scales = measure_scales(expert.observations[expert.valid])
+    return float(distances(expert, student, scales).mean())
