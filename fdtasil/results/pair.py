@@ -89,7 +89,7 @@ def evaluate_pair(
 def _warn(expert: Episodes, student: Episodes, reference: float) -> None:
     """Warn of returns that mean less than they seem to."""
     mean = expert.returns.mean()
-    if mean <= reference:
+    if not mean > reference:  # also where it is no number
         chance = "" if np.median(expert.returns) > 0 else ", that of random actions"
         warn(
             f"the expert's return {mean:.4g} is not above {reference:.4g}{chance}: no normalised "
