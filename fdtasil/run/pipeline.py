@@ -21,6 +21,7 @@ from fdtasil.probes.spread import SpreadLike
 from fdtasil.progress import Progress
 from fdtasil.results.constraints import Constraints, check_constraints
 from fdtasil.results.distilled import Distilled, write_run
+from fdtasil.results.evaluation import Evaluation
 from fdtasil.results.pair import evaluate_pair
 from fdtasil.results.size import size_of_expert, size_of_student
 from fdtasil.rollouts.behaviours import follow
@@ -29,7 +30,7 @@ from fdtasil.rollouts.episodes import Episodes
 from fdtasil.run.account import Account
 from fdtasil.run.arguments import read_arguments
 from fdtasil.run.asking import Asking
-from fdtasil.run.checkpoints import Checkpoints
+from fdtasil.run.checkpoints import Checkpoints, Trained
 from fdtasil.run.collecting import Collecting
 from fdtasil.run.configuration import Configuration
 from fdtasil.run.dataset_gate import examine_given
@@ -285,22 +286,8 @@ def _complete(
         theirs = _examined(rounds, subject, given, force=force)
         checkpoints.account.start_clock()
         lesson, trained = rounds.complete(given, theirs)
-        seconds, student, evaluation = checkpoints.account.seconds, trained.student, None
-        if subject.expert is not None and subject.pool is not None and theirs is not None:
-            last = trained.history[-1]
-            evaluation = evaluate_pair(
-                follow(lesson.view.policy(student.act)),
-                subject.expert,
-                theirs,
-                subject.pool,
-                run.horizon,
-                run.seed,
-                rounds.training.progress,
-                constraints,
-                run.observation_size - run.past - run.remembered,
-            )
-            about = int(last["round"]), trained.steps, last
-            rounds.training.callback(Event("evaluation", *about, student, evaluation))
+        seconds, student = checkpoints.account.seconds, trained.student
+        evaluation = _evaluated(rounds, subject, theirs, lesson, trained, constraints)
         if run.fit.steps is None and run.fit.epochs is None:  # else the caller chose the length
             act, steps = lesson.view.policy(student.act), trained.steps
             warn_of_misfit(lesson, act, steps, remembers=subject.remembered > 0)
@@ -331,6 +318,34 @@ def _complete(
         dataset=lesson.dataset,
         view=lesson.view,
     )
+
+
+def _evaluated(
+    rounds: Rounds,
+    subject: Subject,
+    theirs: Episodes | None,
+    lesson: Lesson,
+    trained: Trained,
+    constraints: Constraints | None,
+) -> Evaluation | None:
+    """Compare the student with the expert's episodes, where there are any, and tell of it."""
+    if subject.expert is None or subject.pool is None or theirs is None:
+        return None
+    run, last = rounds.run, trained.history[-1]
+    evaluation = evaluate_pair(
+        follow(lesson.view.policy(trained.student.act)),
+        subject.expert,
+        theirs,
+        subject.pool,
+        run.horizon,
+        run.seed,
+        rounds.training.progress,
+        constraints,
+        run.observation_size - run.past - run.remembered,
+    )
+    about = int(last["round"]), trained.steps, last
+    rounds.training.callback(Event("evaluation", *about, trained.student, evaluation))
+    return evaluation
 
 
 def _examined(
