@@ -260,6 +260,14 @@ FAULTS = {
         255: "observations of which nothing can be moved a little",
         256: "rounding beside an offset, in the law of a loop",
     },
+    "what numbers say": {
+        272: "a first pair of returns that are zero, in an interval",
+        273: "few pairs, some without a return of the expert, in an interval",
+        274: "an action in large units beside others, where an expert is measured or known again",
+        275: "a function that is the identity at demonstrated states, and not where probes lead",
+        276: "directions that move a part of the coordinates, in the weight of the loss",
+        277: "episodes of other lengths, in one spectrum",
+    },
     "what is silently another thing": {
         230: "a coordinate in small units, taken for one that stands still",
         231: "bounds of an array or a dataset that are as large as float32",
@@ -287,6 +295,7 @@ FAULTS = {
         268: "another size than a student on a robot sees",
         269: "a run that has not ended, in the place of a finished one",
         271: "a student that is judged in another environment than its own",
+        278: "a dataset of later rounds alone, or of reversed arrays and doubles",
         270: "trust that does not reach the policy that asks for it",
     },
 }

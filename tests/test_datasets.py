@@ -3,6 +3,7 @@
 import importlib
 import io
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -14,6 +15,7 @@ import fdtasil
 from fdtasil import Fit, Mlp
 from fdtasil.demonstrations.dataset import Dataset, load_dataset
 from fdtasil.errors import ExpertError, FdtasilWarning, SettingError, StorageError
+from fdtasil.probes.answers import Answers
 from fdtasil.student.view import View
 
 
@@ -165,6 +167,21 @@ def test_a_wrong_view_is_refused(wrong):
         View.of(wrong, states)
 
 
+@pytest.mark.fault(275)
+def test_a_view_that_cuts_off_where_probes_lead_is_no_identity():
+    """No demonstrated state is cut, as with the limits of a normaliser; moved ones are."""
+    cut = lambda rows: np.clip(rows, -1, 1)  # noqa: E731
+    states = np.random.default_rng(0).uniform(0.1, 1, (50, 2)).astype(np.float32)
+    numbers = np.tile(np.array([0, 1], np.int32), (50, 1))
+    around = Answers(np.eye(2, dtype=np.float32), numbers, np.zeros((50, 2, 1, 1)), np.ones(2))
+    view = View.of(cut, states)
+    found = view.answers(around, states, (1.0,))
+    trained_at = states[:, None] + found.displacements[found.numbers]
+    assert trained_at == pytest.approx(cut(states[:, None] + np.eye(2)), abs=1e-6)
+    with pytest.raises(SettingError, match="a curved function"):
+        view.answers(around, states, (1.0, -1.0))
+
+
 def test_a_chosen_view_survives_saving(linear, tmp_path):
     result = fdtasil.distill(linear, TOY, 3, student_obs=[3, 0], **QUICK)
     again = fdtasil.Distilled.load(result.save(tmp_path))
@@ -260,6 +277,40 @@ def test_a_student_of_plain_arrays_and_an_expert_without_an_environment(arrays, 
     assert result.evaluation is None
     cloned = fdtasil.distill(dataset=data, fit=fdtasil.Fit(steps=20), probes=0)
     assert sum(cloned.queries.values()) == 0
+
+
+@pytest.mark.fault(278)
+@pytest.mark.parametrize("change", ["reversed", "doubles"])
+def test_arrays_of_anybody_are_learnt_from(change, linear):
+    """Reversed twice they are what they were, but views of what lies backwards."""
+    given = fdtasil.distill(linear, TOY, 3, **QUICK).dataset
+
+    def changed(array):
+        if change == "doubles":
+            return array.astype(np.float64) if array.dtype == np.float32 else array
+        return np.ascontiguousarray(array[::-1])[::-1]
+
+    def every(part):
+        return replace(part, **{name: changed(array) for name, array in vars(part).items()})
+
+    other = replace(
+        given, demonstrations=every(given.demonstrations), answers=every(given.answers)
+    )
+    run = {"fit": QUICK["fit"], "student": QUICK["student"]}
+    ours, theirs = (fdtasil.distill(dataset=one, **run).student for one in (other, given))
+    assert ours.to_bytes() == theirs.to_bytes()
+
+
+@pytest.mark.fault(278)
+def test_later_rounds_alone_are_learnt_from(linear):
+    run = {**QUICK, "trainer": fdtasil.DAgger(updates=(1,))}
+    given = fdtasil.distill(linear, TOY, 0, **run).dataset
+    states = given.demonstrations
+    later = replace(given, demonstrations=states.at(states.round == 1))
+    assert len(later.demonstrations) < len(states)
+    about = {"fit": QUICK["fit"], "student": QUICK["student"]}
+    found = fdtasil.distill(probes=0, dataset=later, student_obs=lambda rows: rows[:, :3], **about)
+    assert found.student.observation_size == 3
 
 
 def test_ends_of_episodes_as_others_have_them(arrays):

@@ -9,6 +9,7 @@ from test_memory import Remembers
 
 import fdtasil
 from fdtasil.errors import SettingError
+from fdtasil.rollouts.spaces import Spaces, flat_layout
 
 pytestmark = pytest.mark.usefixtures("no_pictures")
 
@@ -190,10 +191,12 @@ def test_another_past_or_memory_than_the_datasets_is_refused(file):
 
 
 @pytest.mark.fault(234)
-def test_what_is_remembered_is_what_an_environment_with_one_bound_takes():
+@pytest.mark.parametrize("spaces", [None, Spaces(flat_layout(N + PAST), flat_layout(M))])
+def test_what_is_remembered_is_what_an_environment_with_one_bound_takes(spaces):
     size, low, high = N + PAST, np.zeros(M), np.full(M, np.inf)
+    random = torch.Generator().manual_seed(0)
     student = fdtasil.Student(
-        fdtasil.Mlp(8), np.zeros(size), np.ones(size), low, high, torch.Generator().manual_seed(0)
+        fdtasil.Mlp(8), np.zeros(size), np.ones(size), low, high, random, spaces=spaces
     )
     policy, past = fdtasil.History(student, H), np.zeros(PAST)
     for step, row in enumerate(np.random.default_rng(0).standard_normal((20, N))):

@@ -6,8 +6,11 @@ import pytest
 from fdtasil.errors import SettingError
 from fdtasil.probes.adaptive import AdaptiveDirections, is_redundant
 from fdtasil.probes.directions import OrthogonalFrames, RandomSphere
+from fdtasil.probes.scales import measure_scales
 from fdtasil.probes.source import DIRECTIONS, Probes
 from fdtasil.probes.stencils import CENTRAL, FORWARD
+from fdtasil.probes.surroundings import Surroundings
+from fdtasil.run.presets import PRESETS
 
 
 def design_of(name, count):
@@ -65,6 +68,22 @@ def test_the_mean_square_of_a_derivative_is_the_jacobians(design):
     bank, numbers = directions.around(states(6))(600, np.random.default_rng(0))
     squares = 6 * ((bank[numbers] @ jacobian.T) ** 2).sum(axis=-1)
     assert squares.mean() == pytest.approx((jacobian**2).sum(), rel=0.05)
+
+
+@pytest.mark.fault(276)
+@pytest.mark.parametrize("design", ["sphere:40", "orthogonal:4", "adaptive:40", "basis"])
+@pytest.mark.parametrize("spread", [{}, {1: 20.0}, {0: 1.0, 1: 2.0, 2: 1.0, 3: 1.0}])
+def test_the_mean_square_is_the_jacobians_where_parts_move_alone(design, spread):
+    random = np.random.default_rng(0)
+    scales = measure_scales(random.standard_normal((2000, 4))).spread_by(spread)
+    jacobian = random.standard_normal((2, 4)) / scales.deviation
+    probes = PRESETS["standard"].complete(Probes.parse(f"{design},radius=0.3")).with_order(1)
+    rows = random.standard_normal((2000, 4)).astype(np.float32)
+    drawn = Surroundings.of(rows, probes, scales).sample(random)
+    moved = drawn.displacements[drawn.numbers] @ jacobian.T
+    squares = ((drawn.gains[drawn.numbers][..., None] * moved) ** 2).sum(axis=-1)
+    whole = ((jacobian * scales.deviation) ** 2).sum()
+    assert squares.mean() == pytest.approx(whole, rel=0.05)
 
 
 @pytest.mark.fault(85)

@@ -1,5 +1,8 @@
 """Roughness of actions: known signals have known values."""
 
+from dataclasses import replace
+
+import gymnasium
 import numpy as np
 import pytest
 from conftest import QUICK
@@ -24,7 +27,8 @@ def played(signal, horizon=32, done="box"):
         return Decision(np.tile(np.float32([value, 0.5]), (len(observations), 1)), None)
 
     with EnvironmentPool(lambda: InForm("box", done, wall=99)) as pool:
-        return smoothness_of(rollout(act, pool, [0, 1], horizon), pool)
+        episodes = rollout(act, pool, [0, 1], horizon)
+        return smoothness_of(episodes, pool, episodes)
 
 
 @pytest.mark.parametrize(
@@ -46,6 +50,39 @@ def test_known_signals(signal, rough, fast):
         assert found.high_frequency is None
     else:
         assert found.high_frequency == pytest.approx(fast, abs=1e-6)
+
+
+@pytest.mark.fault(277)
+def test_every_step_counts_the_same_in_the_spectrum():
+    """A slow sine of 64 steps, and a fall of 16 fast ones with half of its squares."""
+
+    def act(observations, _):
+        k = len(steps)
+        steps.append(k)
+        slow, fast = 0.5 * np.sin(2 * np.pi * k / 64), 0.5 * (-1) ** k
+        return Decision(np.float32([[slow, 0], [fast, 0]]), None)
+
+    steps = []
+    with EnvironmentPool(lambda: InForm("box", "box", wall=99)) as pool:
+        episodes = rollout(act, pool, [0, 1], 64)
+        valid = episodes.valid.copy()
+        valid[1, 16:] = False
+        episodes = replace(episodes, valid=valid)
+        found = smoothness_of(episodes, pool, episodes)
+    assert found.high_frequency == pytest.approx(1 / 3, abs=1e-3)
+
+
+def test_actions_without_bounds_are_measured_by_the_experts():
+    unbounded = lambda: gymnasium.wrappers.TransformAction(  # noqa: E731
+        InForm("box", "box", wall=99),
+        lambda action: np.clip(action, -1, 1),
+        gymnasium.spaces.Box(-np.inf, np.inf, (2,)),
+    )
+    law = lambda x: -x[:, :2] - x[:, 2:4]  # noqa: E731
+    found = fdtasil.evaluate(
+        lambda x: 10 * law(x), law, unbounded, episodes=2, horizon=20, progress=False
+    )
+    assert found.roughness > 3 * found.expert_roughness
 
 
 def test_short_episodes():

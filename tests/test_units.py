@@ -6,12 +6,12 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from conftest import GAIN
+from conftest import GAIN, QUICK
 from toy_environments import Integrator
 from toy_tasks import linear_task, stream
 
 import fdtasil
-from fdtasil.errors import EnvironmentFault, FdtasilWarning
+from fdtasil.errors import EnvironmentFault, FdtasilWarning, SettingError
 from fdtasil.files.onnx.export import export_module
 from fdtasil.probes.scales import measure_scales
 from fdtasil.progress import Progress
@@ -158,3 +158,67 @@ def test_bounds_as_large_as_float32_are_none():
     result = fdtasil.distill(None, None, 0, dataset=data, student=Mlp(8), fit=Fit(steps=200))
     assert not np.isfinite(result.student.low.numpy()).any()
     assert result.history[-1]["action_error"] < 0.9 * result.history[0]["action_error"]
+
+
+def noisy_and_smooth(unit):
+    """Action 0 is noisy, though it repeats itself, and action 1 smooth, in a unit of its own."""
+
+    def law(rows):
+        rows = np.asarray(rows, np.float64)
+        noise = 0.05 * np.sin(1e6 * rows.sum(axis=1))
+        return np.stack([np.tanh(rows[:, 0]) + noise, unit * np.tanh(rows[:, 1])], axis=1)
+
+    return law
+
+
+@pytest.mark.fault(274)
+@pytest.mark.parametrize("bound", [None, np.array([1.0, 1000.0])])
+def test_an_action_in_millimetres_does_not_hide_the_noise_of_another(bound):
+    rows = np.random.default_rng(0).standard_normal((200, 4)).astype(np.float32)
+    found = []
+    for unit in (1.0, 1000.0):
+        law = noisy_and_smooth(unit)
+        ends = (
+            {} if bound is None else {"low": -(bound ** (unit > 1)), "high": bound ** (unit > 1)}
+        )
+        data = fdtasil.from_arrays(rows, law(rows), **ends)
+        result = fdtasil.distill(law, probes=3, dataset=data, fit=Fit(steps=5), student=Mlp(4))
+        found.append(result.report["calibration"])
+    assert found[0]["regime"] == found[1]["regime"] != "smooth"
+    assert found[0]["stencil"] == found[1]["stencil"] == "central"
+    assert found[1]["noise_floor"] == pytest.approx(found[0]["noise_floor"], rel=0.3)
+
+
+@pytest.mark.fault(274)
+def test_one_action_in_millimetres_makes_no_law_steep():
+    rows = np.random.default_rng(0).standard_normal((500, 17)).astype(np.float32)
+    weights = 1.5 * np.random.default_rng(1).standard_normal((17, 40)) / 17**0.5
+    for units in (np.ones(40), np.array([1000.0, *[1] * 39])):
+        law = lambda x, units=units: units * np.tanh(x @ weights)  # noqa: E731
+        data = fdtasil.from_arrays(rows, law(rows))
+        result = fdtasil.distill(law, probes=3, dataset=data, fit=Fit(steps=5), student=Mlp(4))
+        assert result.report["calibration"]["match"] is None
+
+
+def scaled_actions(unit):
+    """Return a function that makes an environment of two actions, one of them in a unit."""
+    box = gymnasium.spaces.Box(-np.inf, np.inf, (2,))
+    return lambda: gymnasium.wrappers.TransformAction(
+        Integrator(), lambda action: np.clip(action / [unit, 1.0], -1, 1), box
+    )
+
+
+@pytest.mark.fault(274)
+@pytest.mark.parametrize("unit", [1, 1000])
+def test_another_expert_is_found_by_an_action_in_small_numbers_too(unit, tmp_path):
+    law = lambda rows: np.tanh(rows[:, :2]) * [unit, -1.0]  # noqa: E731
+    other = lambda rows: law(rows) * [1.0, -1.0]  # noqa: E731
+    run = {**QUICK, "probes": 0}
+    rows = np.random.default_rng(0).standard_normal((200, 5)).astype(np.float32)
+    data = fdtasil.from_arrays(rows, law(rows))
+    with pytest.warns(FdtasilWarning, match="otherwise than the demonstrations at 1[56] of 16"):
+        fdtasil.distill(other, dataset=data, probes=0, fit=Fit(steps=5), student=Mlp(4))
+    with pytest.raises(ZeroDivisionError):
+        fdtasil.distill(law, scaled_actions(unit), out=tmp_path, callback=lambda _: 1 / 0, **run)
+    with pytest.raises(SettingError, match="begun with another expert"):
+        fdtasil.distill(other, scaled_actions(unit), resume=tmp_path, **run)

@@ -71,6 +71,11 @@ class Dataset:
         return states.observations.shape[1], states.actions.shape[1]
 
     @property
+    def choices(self) -> tuple[tuple[int, int], ...]:
+        """First score of each choice, and the one after its last."""
+        return self.spaces.actions.choices if self.spaces else ()
+
+    @property
     def own_size(self) -> int:
         """Length of the environment's own observation, which past and memory stand behind."""
         n, m = self.sizes

@@ -50,8 +50,8 @@ _COHERENT = 0.75
 # controller, which are smooth at most states, 0.5, trees and int8 less.
 _ROUGH = 0.62
 _ROUGH_RADIUS = 0.5
-# Change of an action at the radius, in units of its deviation over the states, above which the law
-# is steep for the scale that it is probed at: a swing-up that ends in a stiff balance has 2.4,
+# Change of the actions at the radius, beside how they vary over the states, above which the law is
+# steep for the scale that it is probed at: a swing-up that ends in a stiff balance has 2.4,
 # networks that walk 0.5 to 1. Differences alone then count more than the actions do.
 _STEEP = 1.5
 _RAYS = 4  # that are answered throughout, at least
@@ -74,13 +74,13 @@ class Calibration:
     Attributes:
         regime: "smooth", "noisy" (a derivative exists above a noise that differences at small
             radii show), or "steps" (no radius has one).
-        noise_floor: Root mean square error of an action, from second differences at the smallest
-            radius, where nothing but rounding and noise is left of them.
+        noise_floor: Root mean square error of an action in its unit, from second differences at
+            the smallest radius, where nothing but rounding and noise is left of them.
         radius: Suggested, in standard deviations of each coordinate.
         stencil: Suggested, "forward" or "central".
         match: Suggested where the law is steep or switches, "both"; else None.
         similarity: Secant similarity at each radius and a quarter of it; the first is NaN.
-        change: Root mean square change of an action at each radius.
+        change: Root mean square change of an action in its unit, at each radius.
         radii: The radii, ascending.
         queries: Rows asked.
         no_answer: Radius, and share of the states moved so far where the expert has no answer;
@@ -165,6 +165,7 @@ def calibrate(
     random: np.random.Generator,
     usual: float,
     ladder: Ladder = _WHOLE,
+    units: np.ndarray | None = None,
 ) -> Calibration:
     """Ask an expert at a ladder of radii on both sides of some states.
 
@@ -175,6 +176,8 @@ def calibrate(
         random: Draws states and directions.
         usual: The radius that teaches best where the expert allows it.
         ladder: How much is asked.
+        units: (m,) that actions are measured in, from `action_units`, so that one in millimetres
+            does not decide alone; None for their own.
     """
     rays, radii = ladder.rays, ladder.radii
     rows = random.choice(len(observations), size=rays, replace=len(observations) < rays)
@@ -188,6 +191,8 @@ def calibrate(
     centres = expert.ask(observations[rows], "calibrate").astype(np.float64)
     answers = ask_moved(expert, points.reshape(-1, len(scale)), "calibrate")
     values = answers.reshape(rays, len(radii), 2, -1).astype(np.float64)
+    if units is not None:
+        centres, values = centres / units, values / units
     kept = _resolved(
         points - observations[rows][:, None, None, :].astype(np.float64), moved, scale
     )
@@ -203,7 +208,8 @@ def calibrate(
     change = np.sqrt(((values - centres[:, None, None, :]) ** 2).mean(axis=(0, 2, 3)))
     regime, radius, stencil = _judge(similarity, radii[1:], usual)
     radius = min(radius, float(radii[-1]))  # where it still answers
-    steep = np.interp(np.log(radius), np.log(radii), change) > _STEEP * centres.std(axis=0).mean()
+    varied = np.sqrt(centres.var(axis=0).mean())
+    steep = np.interp(np.log(radius), np.log(radii), change) > _STEEP * varied
     # Where some have no answer, few may be left, and farther away there are fewer still.
     switches = not shares and _switches(values, centres)
     return Calibration(

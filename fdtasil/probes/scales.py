@@ -1,13 +1,13 @@
 """How far each coordinate of the observations moves: what is divided by, what is probed."""
 
-from collections.abc import Mapping
-from dataclasses import dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from fdtasil.errors import SettingError
 
-__all__ = ["ROUNDING", "Scales", "measure_scales"]
+__all__ = ["ROUNDING", "Scales", "action_units", "measure_actions", "measure_scales"]
 
 # A coordinate whose deviation is below this share of the median one does not move: what is left
 # is rounding (Humanoid has one of 1.8e-14), and dividing by it would blow up the first bump.
@@ -86,3 +86,32 @@ def measure_scales(observations: np.ndarray, seen: np.ndarray | None = None) -> 
     scale = np.where(live, deviation, 1.0)
     visible = np.ones_like(live) if seen is None else seen
     return Scales(mean, scale, deviation, live, visible, np.zeros_like(live))
+
+
+def measure_actions(actions: np.ndarray, choices: Iterable[tuple[int, int]] = ()) -> Scales:
+    """Measure how far each action goes.
+
+    Args:
+        actions: (N, m) of the expert.
+        choices: First score of each choice, and the one after its last: all scores of a choice
+            have one scale, around zero.
+    """
+    own = measure_scales(actions)
+    mean, scale = own.mean.copy(), own.scale.copy()
+    for start, end in choices:
+        size = float(np.sqrt(np.square(actions[:, start:end], dtype=np.float64).mean()))
+        mean[start:end], scale[start:end] = 0.0, size or 1.0
+    return replace(own, mean=mean, scale=scale)
+
+
+def action_units(low: np.ndarray, high: np.ndarray, actions: Scales) -> np.ndarray:
+    """Return what each action is measured in, (m,): half of its range, or its own scale.
+
+    Args:
+        low: (m,) lower bounds.
+        high: (m,) upper ones; where one of both is infinite, the scale counts.
+        actions: From `measure_actions`.
+    """
+    with np.errstate(invalid="ignore"):  # of infinite bounds, which are not chosen
+        half = (high.astype(np.float64) - low) / 2
+    return np.where(np.isfinite(half) & (half > 0), half, actions.scale)

@@ -109,23 +109,33 @@ class Surroundings:
         if self.ends[0] != self.ends[1]:
             near, far = np.log(self.ends)
             stretch = np.exp(random.uniform(near, far, stretch.shape))
+        apart = np.zeros(len(bank), bool)
         if self.told.any() and not self.probes.exact and self.probes.directions.reach(2) > 1:
-            self._take_apart(bank, random)
+            apart = self._take_apart(bank, random)
         displacements = np.zeros((len(bank), self.observations.shape[1]), np.float32)
         displacements[:, self.live] = (
             stretch.astype(np.float32) * bank * self.units.astype(np.float32)
         )
         gains = len(self.live) ** 0.5 / (self.step * stretch[:, 0])
+        # Half of the directions tell of the whole Jacobian, a quarter each of its two parts:
+        # weighed so, these are the whole again.
+        gains[apart] *= 2**0.5
         return Drawn(displacements, numbers, gains)
 
-    def _take_apart(self, bank: np.ndarray, random: np.random.Generator) -> None:
-        """Let a quarter of (P, d) directions move only what was told of, and a quarter not."""
+    def _take_apart(self, bank: np.ndarray, random: np.random.Generator) -> np.ndarray:
+        """Let a quarter of (P, d) directions move only what was told of, and a quarter not.
+
+        Returns:
+            (P,) bool, which move a part of the coordinates.
+        """
         lot, normal = random.random(len(bank)), random.standard_normal(bank.shape, np.float32)
         alone, rest = lot < _ALONE, (lot >= _ALONE) & (lot < 2 * _ALONE)
         # Drawn anew: directions between demonstrated states leave still what is still in them.
         bank[alone] = _kept(normal[alone], self.told)
-        if not self.told.all():
-            bank[rest] = _kept(bank[rest], ~self.told)
+        if self.told.all():
+            return np.zeros(len(bank), bool)
+        bank[rest] = _kept(bank[rest], ~self.told)
+        return alone | rest
 
 
 def _kept(directions: np.ndarray, moved: np.ndarray) -> np.ndarray:

@@ -1,5 +1,7 @@
 """Paired evaluation: student and expert from the same starts, with an interval."""
 
+from warnings import catch_warnings, simplefilter
+
 import numpy as np
 
 from fdtasil.errors import warn
@@ -59,8 +61,8 @@ def evaluate_pair(
     meaningful = float(theirs.mean()) > reference and reset.mean() <= 0.5
     error, agreement = _nearness(student_episodes, expert, pool)
     our_violations = violated(limits, student_episodes, pool, own)
-    our_smoothness = smoothness_of(student_episodes, pool)
-    their_smoothness = smoothness_of(expert_episodes, pool)
+    our_smoothness = smoothness_of(student_episodes, pool, expert_episodes)
+    their_smoothness = smoothness_of(expert_episodes, pool, expert_episodes)
     return Evaluation(
         episodes=len(seeds),
         horizon=horizon,
@@ -151,19 +153,24 @@ def _interval(ours: np.ndarray, theirs: np.ndarray, seed: int) -> tuple[float, f
 
     if len(ours) < 2:
         return None
-    if np.array_equal(ours * theirs[0], theirs * ours[0]):  # one ratio for all: nothing to draw
+    largest = np.abs(theirs).argmax()  # a pair of zeros has every ratio
+    if np.array_equal(ours * theirs[largest], theirs * ours[largest]):
         point = _share(ours, theirs)
         return point, point
-    result = stats.bootstrap(
-        (ours, theirs),
-        ratio,
-        paired=True,
-        vectorized=True,
-        method="percentile",
-        n_resamples=_RESAMPLES,
-        rng=generator(seed, "bootstrap"),
-    )
-    return float(result.confidence_interval.low), float(result.confidence_interval.high)
+    # Few pairs, some without a return of the expert: a draw of these alone has no ratio.
+    with np.errstate(divide="ignore", invalid="ignore"), catch_warnings():
+        simplefilter("ignore", stats.DegenerateDataWarning)
+        found = stats.bootstrap(
+            (ours, theirs),
+            ratio,
+            paired=True,
+            vectorized=True,
+            method="percentile",
+            n_resamples=_RESAMPLES,
+            rng=generator(seed, "bootstrap"),
+        )
+    low, high = map(float, found.confidence_interval)
+    return (low, high) if np.isfinite([low, high]).all() else None
 
 
 def _imitation_gap(student: Episodes, expert: Episodes) -> float:

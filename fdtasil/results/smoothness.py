@@ -4,6 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from fdtasil.probes.scales import action_units, measure_actions
 from fdtasil.rollouts.environments import EnvironmentPool
 from fdtasil.rollouts.episodes import Episodes
 
@@ -17,7 +18,8 @@ class Smoothness(NamedTuple):
 
     Attributes:
         roughness: Mean change of an action from one step to the next: of bounded actions in units
-            of half their range, of others of their deviation, of choices the share that change.
+            of half their range, of others of the expert's deviation, of choices the share that
+            change.
             None where no episode has two steps.
         high_frequency: Share of the power of the actions' changes about their mean that is faster
             than half of the fastest that the time step allows (a period of four steps); None for
@@ -28,8 +30,14 @@ class Smoothness(NamedTuple):
     high_frequency: float | None
 
 
-def smoothness_of(episodes: Episodes, pool: EnvironmentPool) -> Smoothness:
-    """Measure the actions of some episodes, as the environment took them."""
+def smoothness_of(episodes: Episodes, pool: EnvironmentPool, expert: Episodes) -> Smoothness:
+    """Measure the actions of some episodes, as the environment took them.
+
+    Args:
+        episodes: Whose actions are measured.
+        pool: The environment.
+        expert: Whose actions the units are of, where they have no bounds.
+    """
     chosen, m = pool.spaces.actions, pool.boxes.action_size
     flat, _ = pool.bounds.put_inside(episodes.actions.reshape(-1, m))
     acted = flat.reshape(episodes.actions.shape).astype(np.float64)
@@ -39,10 +47,8 @@ def smoothness_of(episodes: Episodes, pool: EnvironmentPool) -> Smoothness:
     if chosen.choices:
         best = chosen.best(acted.reshape(-1, m)).reshape(*episodes.valid.shape, -1)
         return Smoothness(float((best[:, 1:] != best[:, :-1])[both].mean()), None)
-    boxes = pool.boxes
-    deviation = acted[episodes.valid].std(axis=0)
-    with np.errstate(invalid="ignore"):  # of infinite bounds, which are not chosen
-        units = np.where(boxes.bounded, (boxes.high - boxes.low) / 2, deviation)
+    actions = measure_actions(expert.actions[expert.valid])
+    units = action_units(pool.boxes.low, pool.boxes.high, actions)
     scaled = acted / np.where(units > 0, units, 1.0)
     rough = float(np.abs(np.diff(scaled, axis=1))[both].mean())
     return Smoothness(rough, _high_frequency(scaled, episodes.lengths))
@@ -57,6 +63,7 @@ def _high_frequency(actions: np.ndarray, lengths: np.ndarray) -> float | None:
         frequencies = np.fft.rfftfreq(length)
         power = np.abs(np.fft.rfft(mine - mine.mean(axis=0), axis=0)) ** 2
         power[(frequencies > 0) & (frequencies < 0.5)] *= 2  # each stands for its negative too
+        power /= length  # its sum is that of the squares: every step counts the same
         fast += float(power[frequencies > 0.25].sum())
         total += float(power.sum())
     return fast / total if total > 0 else None

@@ -2,9 +2,9 @@
 
 from dataclasses import replace
 
-import numpy as np
 import torch
 
+from fdtasil.demonstrations.dataset import Dataset
 from fdtasil.demonstrations.states import Demonstrations
 from fdtasil.errors import SettingError
 from fdtasil.experts.expert import Expert
@@ -12,7 +12,7 @@ from fdtasil.probes.answers import FROM_THE_START, Answers, Beginning, ask_probe
 from fdtasil.probes.calibration import Calibration, calibrate
 from fdtasil.probes.derivatives import check_derivatives, comparison_rows
 from fdtasil.probes.device_twin import DeviceTwin
-from fdtasil.probes.scales import Scales
+from fdtasil.probes.scales import Scales, action_units, measure_actions
 from fdtasil.probes.surroundings import Surroundings
 from fdtasil.run.account import Account
 from fdtasil.run.configuration import Configuration
@@ -40,12 +40,15 @@ class Asking:
         self.source = run.probes
         self.calibration: Calibration | None = None
 
-    def calibrate(self, states: np.ndarray, scales: Scales) -> None:
-        """Find what the source leaves open, once, on (N, n) states of the first round."""
+    def calibrate(self, dataset: Dataset, scales: Scales) -> None:
+        """Find what the source leaves open, once, on the states of the first round."""
         run, expert = self._run, self._expert
         if run.calibrated and self.calibration is None and expert is not None:
-            random = generator(run.seed, "calibration")
-            self.take_up(calibrate(expert, states, scales, random, run.usual_radius, run.ladder))
+            states, random = dataset.demonstrations, generator(run.seed, "calibration")
+            actions = measure_actions(states.actions, dataset.choices)
+            units = action_units(dataset.low, dataset.high, actions)
+            about = scales, random, run.usual_radius, run.ladder, units
+            self.take_up(calibrate(expert, states.observations, *about))
 
     def take_up(self, found: Calibration | None) -> None:
         """Fill in what a calibration found, unless it was filled in before."""

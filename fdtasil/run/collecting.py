@@ -22,7 +22,7 @@ from fdtasil.seeding import episode_seeds, generator
 __all__ = ["Collecting"]
 
 _ASKED_AGAIN = 16  # states of an interrupted run
-_SAME = 1e-3  # of two answers, relative to the largest action
+_SAME = 1e-3  # of two answers, relative to the largest of an action
 
 
 @dataclass(frozen=True)
@@ -104,11 +104,12 @@ class Collecting:
         rows, stored = states.observations[chosen], states.actions[chosen]
         answers = self.expert.ask(rows, "check")
         # A planner that found nothing this time is no other expert.
-        apart = np.nan_to_num(np.abs(answers - stored).max(axis=1), nan=0.0)
-        bound = _SAME * float(np.abs(states.actions).max())
-        if (apart <= bound).all():
+        sizes = np.abs(states.actions).max(axis=0)  # of each: one in millimetres is no measure
+        bound = _SAME * np.maximum(sizes, _SAME * sizes.max()) + np.finfo(np.float32).tiny
+        apart = np.nan_to_num((np.abs(answers - stored) / bound).max(axis=1), nan=0.0)
+        if (apart <= 1).all():
             return
-        if farthest_apart(self.expert.ask(rows, "check"), answers) > bound:
+        if farthest_apart(self.expert.ask(rows, "check") / bound, answers / bound) > 1:
             return  # one that does not repeat itself either was let through the gate
         worst = int(apart.argmax())
         raise SettingError(

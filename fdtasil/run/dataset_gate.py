@@ -6,12 +6,14 @@ from fdtasil.demonstrations.dataset import Dataset
 from fdtasil.errors import warn
 from fdtasil.experts.expert import Expert
 from fdtasil.experts.gate import GATE_STATES, admit_expert
+from fdtasil.probes.scales import measure_scales
 from fdtasil.rollouts.behaviours import has_none
 from fdtasil.rollouts.environments import Boxes
 
 __all__ = ["examine_given"]
 
-_SAME = 1e-2  # of the actions' deviation; demonstrators' files round, and clip
+_SAME = 1e-2  # of an action's deviation; demonstrators' files round, and clip
+_STILL = 1e-3  # of the largest deviation, that of an action that hardly moves
 
 
 def examine_given(expert: Expert, given: Dataset, *, admit: bool, force: bool) -> None:
@@ -34,10 +36,11 @@ def examine_given(expert: Expert, given: Dataset, *, admit: bool, force: bool) -
         admit_expert(expert, rows, boxes, force=force)
     answers = expert.ask(rows, "check")
     heard = ~has_none(answers)
-    spread = float(states.actions.std(axis=0, dtype=np.float64).mean()) or 1.0
     clipped = np.clip(answers[heard], given.low, given.high)
-    apart = np.abs(clipped - np.clip(said[heard], given.low, given.high)).max(axis=1, initial=0.0)
-    other = int((apart > _SAME * spread).sum())
+    apart = np.abs(clipped - np.clip(said[heard], given.low, given.high))
+    spread = measure_scales(states.actions).units
+    far = apart > _SAME * np.maximum(spread, _STILL * spread.max())
+    other = int(far.any(axis=1).sum())
     if other:
         warn(
             f"{expert.name} answers otherwise than the demonstrations at {other} of "

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fdtasil.demonstrations.dataset import Dataset
-from fdtasil.probes.scales import Scales, measure_scales
+from fdtasil.probes.scales import Scales, measure_actions, measure_scales
 from fdtasil.probes.spread import Spread
 from fdtasil.rollouts.spaces import Spaces, flat_layout
 from fdtasil.run.checkpoints import Collected
@@ -51,7 +51,7 @@ class Lesson:
             SettingError: If the student can't see so.
         """
         states = collected.dataset.demonstrations
-        first = states.observations[states.round == 0][:256]
+        first = states.observations[states.round == states.round.min()][:256]
         view = View.of(student_obs, first) if before is None else before.view
         if held:
             moved = ~np.isin(np.arange(len(view.seen)), list(held))
@@ -95,13 +95,7 @@ class Lesson:
         dataset = self.dataset
         if (np.isfinite(dataset.low) & np.isfinite(dataset.high)).all():
             return None
-        actions = dataset.demonstrations.actions
-        own = measure_scales(actions)
-        mean, scale = own.mean.copy(), own.scale.copy()
-        for start, end in dataset.spaces.actions.choices if dataset.spaces else ():
-            size = float(np.sqrt(np.square(actions[:, start:end], dtype=np.float64).mean()))
-            mean[start:end], scale[start:end] = 0.0, size or 1.0
-        return replace(own, mean=mean, scale=scale)
+        return measure_actions(dataset.demonstrations.actions, dataset.choices)
 
     @property
     def dataset(self) -> Dataset:

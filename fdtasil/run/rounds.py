@@ -167,7 +167,7 @@ class Rounds:
         """Ask the probes around a round's states; the answers are kept on the way."""
         known = self.checkpoints.take_up(round_, ASKED)
         asking = self.checkpoints.asking
-        asking.calibrate(lesson.dataset.demonstrations.observations, lesson.scales)
+        asking.calibrate(lesson.dataset, lesson.scales)
         # What there is to warn of was said before the first answer.
         around = asking.around(states, lesson.scales, again=known is not None)
         with self.training.progress.bar("probes", "state", len(states)) as bar:

@@ -8,7 +8,7 @@ from fdtasil.errors import printable, without_secrets
 from fdtasil.experts.examination import Looked, look_closely
 from fdtasil.files.storage import write_bytes
 from fdtasil.probes.calibration import Calibration, calibrate
-from fdtasil.probes.scales import measure_scales
+from fdtasil.probes.scales import action_units, measure_actions, measure_scales
 from fdtasil.results.figures import draw_calibration
 from fdtasil.rollouts.environments import EnvironmentPool
 from fdtasil.rollouts.wanted import import_module_of
@@ -68,11 +68,11 @@ def command(
             *_contract(looked, pool),
         ]
     problem = next((finding.problem for finding in looked.findings if finding.problem), None)
-    found = _calibrated(looked, seed)
+    found = _calibrated(looked, pool, seed)
     if found is not None:
         rows += [
             ("regime", found.regime),
-            ("noise floor", f"{found.noise_floor:.1e} of the action, root mean square"),
+            ("noise floor", f"{found.noise_floor:.1e} of an action, root mean square"),
             ("suggested radius", f"{found.radius:.2g} deviations, {found.stencil} stencil"),
             ("what is matched", found.match or "differences"),
         ]
@@ -109,12 +109,14 @@ def _actions(pool: EnvironmentPool) -> str:
     return f"{boxes.action_size}, from {boxes.low.min():g} to {boxes.high.max():g}"
 
 
-def _calibrated(looked: Looked, seed: int) -> Calibration | None:
+def _calibrated(looked: Looked, pool: EnvironmentPool, seed: int) -> Calibration | None:
     if looked.own is None or looked.expert is None:
         return None
     visited, random = looked.own.observations[looked.own.valid], generator(seed, "calibration")
     scales, radius = measure_scales(visited), PRESETS["standard"].radius
-    return calibrate(looked.expert, visited, scales, random, radius)
+    actions = measure_actions(looked.own.actions[looked.own.valid], pool.spaces.actions.choices)
+    units = action_units(pool.boxes.low, pool.boxes.high, actions)
+    return calibrate(looked.expert, visited, scales, random, radius, units=units)
 
 
 def _returns(looked: Looked) -> list[tuple[str, object]]:

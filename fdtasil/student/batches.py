@@ -33,8 +33,8 @@ class Batches:
         random: Callable[[str], torch.Generator],
         device: torch.device,
     ) -> None:
-        self._observations = torch.from_numpy(demonstrations.observations).to(device)
-        self._actions = torch.from_numpy(demonstrations.actions).to(device)
+        self._observations = _floats(demonstrations.observations).to(device)
+        self._actions = _floats(demonstrations.actions).to(device)
         self._random, self._device = random, device
         self._dealer: _Dealer | None = None
         if probes is not None and answers is not None:
@@ -88,8 +88,13 @@ class _Dealer:
     def _fill(self, number: int) -> None:
         answers = self._ask(number)
         self._number = number
-        self._gains = torch.from_numpy(answers.gains).float().to(self._device)
-        self._bank = torch.from_numpy(answers.displacements).to(self._device)
+        self._gains = _floats(answers.gains).to(self._device)
+        self._bank = _floats(answers.displacements).to(self._device)
         self._numbers = torch.from_numpy(np.ascontiguousarray(answers.numbers)).to(self._device)
-        self._values = torch.from_numpy(answers.values).to(self._device)
+        self._values = _floats(answers.values).to(self._device)
         self._used = self._probes.used_per_visit(answers.numbers.shape[1])
+
+
+def _floats(array: np.ndarray) -> Tensor:
+    """Return an array of anybody's, of doubles or a reversed view too, as torch takes it."""
+    return torch.from_numpy(np.ascontiguousarray(array, np.float32))

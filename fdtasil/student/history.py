@@ -77,9 +77,10 @@ class History:
             )
         rows = self._window.behind(seen)[None].astype(np.float32)
         action, spaces = self._student.answer(rows)[0], self._student.spaces
+        # Beyond its one bound the environment cuts an action off: what is done is remembered.
+        taken = np.clip(action, *self._bounds)
         if spaces is None:
-            # Beyond its one bound the environment cuts an action off: what is done is remembered.
-            self._window.push(seen, np.clip(action, *self._bounds))
+            self._window.push(seen, taken)
             return action, None
-        self._window.push(seen, spaces.actions.done(action))
+        self._window.push(seen, spaces.actions.done(taken))
         return spaces.actions.value(action), None

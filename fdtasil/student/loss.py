@@ -66,7 +66,8 @@ class TaylorLoss(NamedTuple):
         derivative_error: (), mean norm of the error of the first differences, in units of the
             whitened Jacobian's Frobenius norm; 0 where none are matched.
         curvature_error: (), mean norm of the error of the second differences, in units of z'Hz
-            for standard normal z in whitened coordinates; 0 in a loss of first order.
+            for z of n whitened coordinates, uniform on the sphere of radius sqrt(n); 0 in a loss
+            of first order.
         moved_error: (), mean norm of the action error at the moved states, in units of the
             actions; 0 where these answers are not matched as labels.
     """

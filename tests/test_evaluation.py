@@ -1,0 +1,65 @@
+"""What an evaluation says of a few numbers that are known."""
+
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+
+import fdtasil
+
+pytestmark = pytest.mark.usefixtures("no_pictures")
+
+
+class Given(gymnasium.Env):
+    """Each episode is a step, which gives what stands in a table: rows by starts, by action."""
+
+    observation_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+    action_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+
+    def __init__(self, theirs, ours):
+        self.table, self.turn, self.seeds = np.stack([theirs, ours]), 0, []
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        if seed not in self.seeds:
+            self.seeds.append(seed)
+        self.turn = self.seeds.index(seed) % self.table.shape[1]
+        return np.float32([self.np_random.uniform(-1, 1)]), {}
+
+    def step(self, action):
+        gives = float(self.table[int(action[0] > 0), self.turn])
+        return np.zeros(1, np.float32), gives, False, False, {}
+
+
+def judged(theirs, ours):
+    """Return the evaluation of a policy with these returns beside an expert with those."""
+    environment = Given(theirs, ours)
+    up, down = (lambda rows, a=a: np.full((len(rows), 1), a, np.float32) for a in (0.5, -0.5))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", RuntimeWarning)
+        return fdtasil.evaluate(up, down, environment, episodes=len(theirs), horizon=1)
+
+
+@pytest.mark.fault(272)
+def test_a_first_pair_of_zeros_does_not_hide_how_others_differ():
+    theirs, ours = np.array([0.0, *[1] * 9]), np.array([0.0, 1, 0, 1, 1, 0, 1, 1, 0, 1])
+    first, last = judged(theirs, ours), judged(theirs[::-1], ours[::-1])
+    assert first.expert_returns == tuple(theirs)
+    assert first.normalized_return == pytest.approx(6 / 9)
+    for found in (first, last):
+        low, high = found.ci95
+        assert low < 0.5 < 0.8 < high
+    same = judged(theirs, theirs)
+    assert same.ci95 == (1.0, 1.0)
+    twice = judged(theirs, 2 * theirs)
+    assert twice.ci95 == (2.0, 2.0)
+
+
+@pytest.mark.fault(273)
+@pytest.mark.parametrize("ours", [[1, 0, 0], [1, 0, 1]])
+def test_few_pairs_without_a_return_have_no_interval(ours):
+    found = judged(np.array([1.0, 1.0, 0.0]), np.array(ours, float))
+    assert found.normalized_return == pytest.approx(sum(ours) / 2)
+    assert found.ci95 is None
+    assert "95 % n/a" in str(found)
