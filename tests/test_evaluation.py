@@ -58,8 +58,19 @@ def test_a_first_pair_of_zeros_does_not_hide_how_others_differ():
 
 @pytest.mark.fault(273)
 @pytest.mark.parametrize("ours", [[1, 0, 0], [1, 0, 1]])
-def test_few_pairs_without_a_return_have_no_interval(ours):
+def test_few_pairs_some_without_a_return_have_an_interval(ours):
     found = judged(np.array([1.0, 1.0, 0.0]), np.array(ours, float))
+    low, high = found.ci95
     assert found.normalized_return == pytest.approx(sum(ours) / 2)
-    assert found.ci95 is None
-    assert "95 % n/a" in str(found)
+    assert -2 < low < found.normalized_return < high < 3
+
+
+@pytest.mark.fault(273)
+def test_a_policy_that_is_worse_from_every_start_is_worse_in_the_interval():
+    """Returns are negative, and the expert is little better than chance from some starts."""
+    theirs, ours = (
+        np.array([-449.0, -136, -1, -1, -336]),
+        np.array([-558.0, -350, -348, -350, -415]),
+    )
+    low, high = judged(theirs, ours).ci95
+    assert low < high < 1

@@ -122,6 +122,12 @@ def test_an_onnx_file_with_one_input_a_key(form, tmp_path):
         feed[entry.name] = value.astype(kinds[entry.type])
     (actions,) = session.run(None, feed)
     assert actions == pytest.approx(result.student.act(rows), abs=1e-5)
+    # It is judged as it stands, choices among its inputs included.
+    again = fdtasil.evaluate(
+        str(tmp_path / "s.onnx"), in_form(law, form), lambda: InForm(form), episodes=2, horizon=20
+    )
+    returns = result.evaluation.student_returns
+    assert again.student_returns == pytest.approx(returns, rel=1e-4)
 
 
 def test_keys_of_observations_without_names(plain, tmp_path):

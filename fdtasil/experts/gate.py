@@ -239,20 +239,31 @@ class _Answers:
         try:
             many = np.tile(self.observations, (repeats, 1))[:rows]
             answers = self.expert.ask(many, "check")
+            wrong, most = self._apart(answers, np.tile(self.answers, (repeats, 1))[:rows])
+            measured = f"{rows:,} rows at once: largest difference {most:.1e}"
+            if not wrong:
+                return Finding(name, measured, None)
+            # The size, or chance that few rows did not show: the same batch once more tells.
+            again, farthest = self._apart(self.expert.ask(many, "check"), answers)
         except ExpertError as error:
             # Named so that nothing can force it: the probes would meet it after hours.
             return Finding("answers", error.found, ExpertError(error.found, *advice))
-        expected = np.tile(self.answers, (repeats, 1))[:rows]
-        difference = np.nan_to_num(np.abs(answers - expected).max(axis=1), nan=0.0)
-        wrong = int((difference > _SAME * self._range()).sum())
-        measured = f"{rows:,} rows at once: largest difference {difference.max():.1e}"
-        if not wrong:
-            return Finding(name, measured, None)
+        if again:
+            found = (
+                f"{self.expert.name} asked the same {rows:,} observations twice differs at "
+                f"{again:,} of them, by up to {farthest:.2g}"
+            )
+            return Finding("determinism", measured, ExpertError(found, *_STOCHASTIC))
         found = (
             f"{self.expert.name} answers {wrong:,} of {rows:,} observations at once otherwise "
-            f"than few, by up to {difference.max():.2g}"
+            f"than few, by up to {most:.2g}"
         )
         return Finding(name, measured, ExpertError(found, *advice))
+
+    def _apart(self, ours: np.ndarray, theirs: np.ndarray) -> tuple[int, float]:
+        """Return at how many rows answers differ, and by how much at most."""
+        difference = np.nan_to_num(np.abs(ours - theirs).max(axis=1), nan=0.0)
+        return int((difference > _SAME * self._range()).sum()), float(difference.max())
 
     def within_bounds(self) -> Finding:
         low, high = self.boxes.low, self.boxes.high

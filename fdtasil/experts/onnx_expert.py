@@ -1,9 +1,10 @@
 """ONNX files as experts, with the names, types and batch sizes that users' files have."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,7 +18,7 @@ from fdtasil.experts.memory import Memory, stateless
 from fdtasil.experts.sizes import size_hint
 from fdtasil.experts.trial import try_out
 from fdtasil.experts.twin import torch_twin
-from fdtasil.files.onnx.binding import bind
+from fdtasil.files.onnx.binding import Choices, Given, bind
 from fdtasil.files.onnx.model import read_model
 from fdtasil.files.onnx.nodes import free_inputs
 from fdtasil.files.onnx.policy import (
@@ -27,7 +28,7 @@ from fdtasil.files.onnx.policy import (
     open_within_limits,
 )
 from fdtasil.files.onnx.recurrent import RecurrentPolicy, find_memory, try_recurrent
-from fdtasil.rollouts.spaces import Spaces
+from fdtasil.rollouts.spaces import Layout, Spaces
 
 if TYPE_CHECKING:
     import onnx
@@ -166,9 +167,7 @@ def _damage_is_named(path: Path) -> Iterator[None]:
         raise cannot_be_asked(str(path), error) from error
 
 
-def _natural_inputs(
-    model: "onnx.ModelProto", spaces: Spaces | None
-) -> dict[str, slice | np.ndarray]:
+def _natural_inputs(model: "onnx.ModelProto", spaces: Spaces | None) -> Mapping[str, Given]:
     """Return what inputs are given whose names or shapes say it.
 
     An input that has the name of a part of the observation is given that part, and the only one
@@ -179,11 +178,25 @@ def _natural_inputs(
         sizes = [d.dim_value for d in entries[0].type.tensor_type.shape.dim][1:]
         stacked = len(sizes) > 1 and all(size > 0 for size in sizes)
         return {entries[0].name: slice(0, math.prod(sizes))} if stacked else {}
-    found: dict[str, slice | np.ndarray] = {}
+    found: dict[str, Given] = {}
     for entry in entries:
         with suppress(KeyError):
             columns = spaces.observations.columns(entry.name) if spaces else {}[entry.name]
             found[entry.name] = slice(columns[0], columns[-1] + 1)
+    return found | (_chosen(entries, spaces.observations) if spaces else {})
+
+
+def _chosen(entries: "Sequence[onnx.ValueInfoProto]", observations: Layout) -> dict[str, Choices]:
+    """Return the parts that are choices, where an input takes their numbers and not ones."""
+    found: dict[str, Choices] = {}
+    named = {entry.name: entry for entry in entries}
+    for part, start in zip(observations.parts, observations.starts, strict=True):
+        if part.name not in named or part.kind != "choice":
+            continue
+        dimensions = named[part.name].type.tensor_type.shape.dim[1:]
+        if math.prod(dimension.dim_value for dimension in dimensions) == len(part.sizes):
+            ends = np.cumsum([start, *part.sizes]).tolist()
+            found[part.name] = Choices(tuple(pairwise(ends)), part.first, part.shape)
     return found
 
 

@@ -24,7 +24,7 @@ class Evaluation:
         normalized_return: (student - reference) / (expert - reference); 1 is the expert. None
             where the expert is no better than the reference, and the share means nothing.
         ci95: 95 % bootstrap interval of the normalised return, over paired episodes; None with it,
-            for a single pair, or where few pairs, some without a return of the expert, have none.
+            or for a single pair. Of fewer than ten pairs it is too narrow.
         survival: Share of the student's episodes that neither the environment ended, nor a policy
             without an answer.
         expert_survival: The same for the expert.

@@ -1,7 +1,5 @@
 """Paired evaluation: student and expert from the same starts, with an interval."""
 
-from warnings import catch_warnings, simplefilter
-
 import numpy as np
 
 from fdtasil.errors import warn
@@ -146,31 +144,28 @@ def _share(ours: np.ndarray, theirs: np.ndarray) -> float:
 
 
 def _interval(ours: np.ndarray, theirs: np.ndarray, seed: int) -> tuple[float, float] | None:
-    from scipy import stats  # loads for most of a second, and many runs end before it
+    """Bootstrap the pairs' share of the expert's mean return, which is held.
 
-    def ratio(a: np.ndarray, b: np.ndarray, axis: int = -1) -> np.ndarray:
-        return a.mean(axis=axis) / b.mean(axis=axis)
-
+    A ratio of two drawn means covers no better, and where the expert's returns lie near the
+    reference some draws have no expert left to be a share of.
+    """
     if len(ours) < 2:
         return None
-    largest = np.abs(theirs).argmax()  # a pair of zeros has every ratio
-    if np.array_equal(ours * theirs[largest], theirs * ours[largest]):
-        point = _share(ours, theirs)
-        return point, point
-    # Few pairs, some without a return of the expert: a draw of these alone has no ratio.
-    with np.errstate(divide="ignore", invalid="ignore"), catch_warnings():
-        simplefilter("ignore", stats.DegenerateDataWarning)
-        found = stats.bootstrap(
-            (ours, theirs),
-            ratio,
-            paired=True,
-            vectorized=True,
-            method="percentile",
-            n_resamples=_RESAMPLES,
-            rng=generator(seed, "bootstrap"),
-        )
-    low, high = map(float, found.confidence_interval)
-    return (low, high) if np.isfinite([low, high]).all() else None
+    share = _share(ours, theirs)
+    beyond = (ours - share * theirs) / theirs.mean()  # what each pair says beyond the share
+    if not beyond.any():
+        return share, share
+    from scipy import stats  # loads for most of a second, and many runs end before it
+
+    found = stats.bootstrap(
+        (beyond,),
+        np.mean,
+        method="percentile",
+        n_resamples=_RESAMPLES,
+        rng=generator(seed, "bootstrap"),
+    )
+    low, high = found.confidence_interval
+    return share + float(low), share + float(high)
 
 
 def _imitation_gap(student: Episodes, expert: Episodes) -> float:

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -12,11 +13,40 @@ from fdtasil.files.onnx.nodes import Nodes, free_inputs
 if TYPE_CHECKING:
     import onnx
 
-__all__ = ["Inputs", "bind", "check_inputs"]
+__all__ = ["Choices", "Given", "Inputs", "bind", "check_inputs"]
 
 Inputs = Mapping[str, Any] | str
 """Name of an input -> a number or an array, which it is given always, or "0:17" (a slice as well),
 the columns of the observation that it is given; as a text "time_step=0,obs=0:17"."""
+
+
+@dataclass(frozen=True)
+class Choices:
+    """Columns of choices, a one in each of them, of which an input is given the numbers.
+
+    Attributes:
+        ends: First column of each choice, and the one after its last, side by side.
+        first: Number of the first possibility of each.
+        shape: Of the numbers of an observation.
+    """
+
+    ends: tuple[tuple[int, int], ...]
+    first: tuple[int, ...]
+    shape: tuple[int, ...]
+
+    @property
+    def start(self) -> int:
+        """The first column."""
+        return self.ends[0][0]
+
+    @property
+    def stop(self) -> int:
+        """The one after the last."""
+        return self.ends[-1][1]
+
+
+Given = slice | Choices | np.ndarray
+"""What an input is given: columns of the observation, the numbers of choices, or constants."""
 
 _NAME = "fdtasil.observation"
 _EXAMPLE = 'write for example inputs={"time_step": 0.0, "obs": "0:17"}'
@@ -74,7 +104,7 @@ def _constant(given: object) -> np.ndarray:
 
 
 def bind(
-    model: "onnx.ModelProto", inputs: "Mapping[str, slice | np.ndarray]", size: int | None
+    model: "onnx.ModelProto", inputs: Mapping[str, Given], size: int | None
 ) -> "onnx.ModelProto":
     """Return a model of one input, the observation, that computes what the given one does.
 
@@ -93,7 +123,7 @@ def bind(
     graph = bound.graph
     entries = free_inputs(graph)
     parts = _complete(entries, inputs, size)
-    n = size or max(part.stop for part in parts.values() if isinstance(part, slice))
+    n = size or max(part.stop for part in parts.values() if not isinstance(part, np.ndarray))
     nodes = Nodes("fdtasil.input_")
     for name, part in parts.items():
         kind = entries[name].type.tensor_type
@@ -103,8 +133,12 @@ def bind(
             dtype = onnx.helper.tensor_dtype_to_np_dtype(kind.elem_type)
             graph.initializer.append(onnx.numpy_helper.from_array(fixed.astype(dtype), name))
             continue
-        held = isinstance(part, np.ndarray)
-        value = _repeat(nodes, part, shape[1]) if held else _take(nodes, part, shape)
+        if isinstance(part, np.ndarray):
+            value = _repeat(nodes, part, shape[1])
+        elif isinstance(part, Choices):
+            value = _numbers(nodes, part)
+        else:
+            value = _take(nodes, part, shape)
         nodes.node("Cast", value, to=kind.elem_type)
         nodes.name_last(name)
     nodes.put_before(bound)
@@ -117,9 +151,9 @@ def bind(
 
 def _complete(
     entries: "Mapping[str, onnx.ValueInfoProto]",
-    inputs: "Mapping[str, slice | np.ndarray]",
+    inputs: Mapping[str, Given],
     size: int | None,
-) -> "dict[str, slice | np.ndarray]":
+) -> dict[str, Given]:
     """Return the part of each input; the one that is left out has the columns that are."""
     listed = ", ".join(_described(entry) for entry in entries.values())
     if unknown := [name for name in inputs if name not in entries]:
@@ -132,7 +166,8 @@ def _complete(
             "all inputs but one, which is given the other columns",
             f'write inputs={{{written}}}, each a number or columns such as "0:3"',
         )
-    taken = sorted((p.start, p.stop) for p in parts.values() if isinstance(p, slice))
+    columns = [part for part in parts.values() if not isinstance(part, np.ndarray)]
+    taken = sorted((part.start, part.stop) for part in columns)
     for name in left:
         dimensions = entries[name].type.tensor_type.shape.dim
         width = dimensions[-1].dim_value if dimensions else 0
@@ -150,24 +185,27 @@ def _complete(
             )
         parts[name] = slice(start, stop)
     for name, part in parts.items():
-        if isinstance(part, slice) and size is not None and part.stop > size:
+        if not isinstance(part, np.ndarray) and size is not None and part.stop > size:
             found = f"inputs: {name!r} is given columns up to {part.stop}"
             raise SettingError(found, f"columns of {size}", _EXAMPLE)
         _check_width(entries[name], part, listed)
-    if not any(isinstance(part, slice) for part in parts.values()):
+    if all(isinstance(part, np.ndarray) for part in parts.values()):
         raise SettingError(
             "inputs: all of them are constants", "one with the observation", _EXAMPLE
         )
     return parts
 
 
-def _check_width(entry: "onnx.ValueInfoProto", part: "slice | np.ndarray", listed: str) -> None:
+def _check_width(entry: "onnx.ValueInfoProto", part: Given, listed: str) -> None:
     """Refuse columns, or a constant, that an input has no place for."""
     dimensions = entry.type.tensor_type.shape.dim
     width = math.prod(dimension.dim_value for dimension in dimensions[1:])
     if not width:
         return
-    given = part.stop - part.start if isinstance(part, slice) else part.size
+    if isinstance(part, Choices):
+        given = len(part.ends)
+    else:
+        given = part.stop - part.start if isinstance(part, slice) else part.size
     if given != width and not (isinstance(part, np.ndarray) and given == 1):
         raise SettingError(
             f"inputs: {entry.name!r} is given {given} numbers, of {listed}",
@@ -182,6 +220,17 @@ def _take(nodes: Nodes, columns: slice, shape: Sequence[int]) -> str:
     if len(shape) > 2 and all(size > 0 for size in shape[1:]):
         flat = nodes.node("Reshape", flat, nodes.integers([-1, *shape[1:]]))
     return flat
+
+
+def _numbers(nodes: Nodes, choices: Choices) -> str:
+    """Add the numbers of choices, in the shape that a part of the observation has."""
+    best = []
+    for (start, stop), first in zip(choices.ends, choices.first, strict=True):
+        chosen = nodes.node("ArgMax", _sliced(nodes, start, stop), axis=1, keepdims=1)
+        best.append(nodes.node("Add", chosen, nodes.integers([first])))
+    return nodes.node(
+        "Reshape", nodes.node("Concat", *best, axis=1), nodes.integers([-1, *choices.shape])
+    )
 
 
 def _repeat(nodes: Nodes, value: np.ndarray, width: int) -> str:
