@@ -296,6 +296,7 @@ FAULTS = {
         269: "a run that has not ended, in the place of a finished one",
         271: "a student that is judged in another environment than its own",
         278: "a dataset of later rounds alone, or of reversed arrays and doubles",
+        279: "bounds, or ends of episodes, that are not those of the arrays",
         270: "trust that does not reach the policy that asks for it",
     },
 }

@@ -424,3 +424,53 @@ def test_what_is_no_dataset_is_not_written_for_minari(quick):
     pytest.importorskip("minari")
     with pytest.raises(SettingError, match=r"write result\.dataset"):
         fdtasil.to_minari(quick, "me/x-v0")
+
+
+@pytest.mark.fault(279)
+def test_recorded_actions_beyond_their_bounds_are_warned_of(arrays, linear):
+    states, actions = arrays
+    with pytest.warns(FdtasilWarning, match=r"\d+ of 40 actions lie beyond low and high, by up"):
+        fdtasil.from_arrays(states, actions, low=-0.1, high=0.1)
+
+
+@pytest.mark.fault(279)
+def test_bounds_that_arrays_lack_are_the_environments(arrays, linear):
+    states, actions = arrays
+    run = {"probes": 0, "horizon": 5, "evaluation_episodes": 2, **SMALL}
+    free = fdtasil.from_arrays(states, actions)
+    result = fdtasil.distill(linear, TOY, dataset=free, **run)
+    assert result.student.low.tolist() == [-1, -1]
+    assert np.abs(result.student.act(100 * states.astype(np.float32))).max() <= 1
+    other = fdtasil.from_arrays(states, actions, low=-9, high=9)
+    with pytest.warns(
+        FdtasilWarning, match=r"bounds are \[-9.0, -9.0\] to \[9.0, 9.0\], those of"
+    ):
+        result = fdtasil.distill(linear, TOY, dataset=other, **run)
+    assert result.student.high.tolist() == [9, 9]
+
+
+def test_an_array_for_each_episode(arrays):
+    states, actions = arrays
+    parts = [states[:15], states[15:]], [actions[:15], actions[15:]]
+    found = fdtasil.from_arrays(*parts)
+    whole = fdtasil.from_arrays(states, actions, episode_ends=[15, 40])
+    assert found.to_bytes() == whole.to_bytes()
+    with pytest.raises(SettingError, match="of other lengths"):
+        fdtasil.from_arrays(parts[0], [actions[:10], actions[10:]])
+    with pytest.raises(SettingError, match="beside episode_ends"):
+        fdtasil.from_arrays(*parts, episode_ends=[15, 40])
+
+
+@pytest.mark.fault(279)
+def test_indices_in_the_place_of_ends_are_warned_of(arrays):
+    with pytest.warns(FdtasilWarning, match="the last episode is a single state"):
+        fdtasil.from_arrays(*arrays, episode_ends=[14, 39])
+    with pytest.raises(SettingError, match=r"episode_ends=\[False False"):
+        fdtasil.from_arrays(*arrays, episode_ends=np.zeros(40, bool))
+
+
+def test_arrays_of_somebody_else_in_a_file(arrays, tmp_path):
+    np.savez(tmp_path / "mine.npz", observations=arrays[0], actions=arrays[1])
+    with pytest.raises(StorageError, match="did not write, with observations, actions") as caught:
+        load_dataset(tmp_path / "mine.npz")
+    assert "from_arrays" in caught.value.next_step

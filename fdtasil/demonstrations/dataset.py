@@ -12,7 +12,7 @@ import numpy as np
 
 from fdtasil.checks import check_path
 from fdtasil.demonstrations.states import Demonstrations
-from fdtasil.errors import SettingError, StorageError
+from fdtasil.errors import SettingError, StorageError, shown
 from fdtasil.files.arrays import arrays_from_bytes
 from fdtasil.files.border import reads
 from fdtasil.files.plain import as_kind
@@ -284,6 +284,12 @@ def _as_kind(name: str, array: np.ndarray) -> np.ndarray:
 
 
 def _read(arrays: Mapping[str, np.ndarray]) -> Dataset:
+    if "about" not in arrays:
+        raise StorageError(
+            f"an npz file that fdtasil did not write, with {shown(', '.join(arrays))}",
+            "a demonstrations.npz of a run",
+            "of arrays: fdtasil.from_arrays(observations, actions, episode_ends=...)",
+        )
     about = from_json(arrays["about"].tobytes())
     if about["version"] > _VERSION:
         raise ValueError(f"version {about['version']} is newer than this fdtasil")

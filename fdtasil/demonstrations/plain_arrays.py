@@ -6,11 +6,13 @@ import numpy as np
 
 from fdtasil.demonstrations.dataset import Dataset, check_dataset
 from fdtasil.demonstrations.states import Demonstrations
-from fdtasil.errors import SettingError
+from fdtasil.errors import SettingError, warn
 from fdtasil.rollouts.flattening import unbounded
 from fdtasil.rollouts.spaces import to_numpy
 
 __all__ = ["from_arrays"]
+
+_ROUNDED = 1e-5  # of the largest bound: what float32 and files round
 
 
 def from_arrays(
@@ -28,11 +30,12 @@ def from_arrays(
     states, without an environment.
 
     Args:
-        observations: (N, n) states.
-        actions: (N, m) what the expert did there, in the environment's units.
+        observations: (N, n) states, or a list of them, (T, n) for each episode.
+        actions: (N, m) what the expert did there, in the environment's units; or such a list.
         episode_ends: (N,) booleans, true at the last state of each episode, or the number of
             states up to each end, as Minari and D4RL have them. Left out, all are of one.
-        low: (m,) lower action bounds, or one number; left out, there are none.
+        low: (m,) lower action bounds, or one number; left out, there are none, or those of the
+            environment that is given beside the dataset.
         high: (m,) upper bounds.
         environment: What to call where they are from.
 
@@ -46,6 +49,8 @@ def from_arrays(
         >>> data.demonstrations.episode.tolist()
         [0, 0, 1, 1, 1, 1]
     """
+    if isinstance(observations, list | tuple) and observations and np.ndim(observations[0]) == 2:
+        observations, actions, episode_ends = _joined(observations, actions, episode_ends)
     rows, labels = _numbers("observations", observations), _numbers("actions", actions)
     if rows.ndim != 2 or labels.ndim != 2 or len(rows) != len(labels) or not len(rows):
         raise SettingError(
@@ -65,7 +70,39 @@ def from_arrays(
         np.zeros(count),
         np.zeros(count, bool),
     )
-    return check_dataset(Dataset(states, None, None, least, most, environment))
+    found = check_dataset(Dataset(states, None, None, least, most, environment))
+    _warn_of_bounds(found)
+    return found
+
+
+def _joined(
+    observations: Any, actions: Any, ends: Any
+) -> tuple[np.ndarray, np.ndarray, list[int]]:
+    """Return the arrays of some episodes as one each, and where the episodes end."""
+    parts = [[to_numpy(part) for part in parts] for parts in (observations, actions)]
+    lengths = [[len(part) for part in side] for side in parts]
+    if ends is not None or lengths[0] != lengths[1]:
+        raise SettingError(
+            f"{len(parts[0])} episodes of observations and {len(parts[1])} of actions, "
+            + ("beside episode_ends" if ends is not None else "of other lengths"),
+            "an array of each for every episode, of equal lengths",
+            "leave episode_ends= out, or join the arrays with np.concatenate",
+        )
+    return np.concatenate(parts[0]), np.concatenate(parts[1]), np.cumsum(lengths[0]).tolist()
+
+
+def _warn_of_bounds(dataset: Dataset) -> None:
+    """Warn of recorded actions that no student reaches."""
+    actions = dataset.demonstrations.actions
+    beyond = np.maximum(actions - dataset.high, dataset.low - actions).max(axis=1)
+    reach = np.where(np.isfinite(dataset.high), np.abs(dataset.high), 1.0).max()
+    outside = int((beyond > _ROUNDED * reach).sum())
+    if outside:
+        warn(
+            f"{outside:,} of {len(actions):,} actions lie beyond low and high, by up to "
+            f"{beyond.max():.2g}: a student stays within them; check that they are the bounds of "
+            "the environment that the actions are for"
+        )
 
 
 def _numbers(name: str, given: Any) -> np.ndarray:
@@ -90,13 +127,19 @@ def _episodes(ends: Any, count: int) -> np.ndarray:
     if ends is None:
         return np.zeros(count, np.int32)
     given = np.asarray(ends)
+    said = f"episode_ends={np.array2string(given, threshold=6)}"
     if given.dtype == bool and given.shape == (count,):
         given = np.flatnonzero(given) + 1
     good = given.ndim == 1 and given.size > 0 and given.dtype.kind in "iu"
     if not good or given[0] < 1 or given[-1] > count or not (np.diff(given) > 0).all():
         raise SettingError(
-            f"episode_ends={np.array2string(given, threshold=6)}",
+            said,
             f"({count},) True at the last state of each episode, or growing numbers up to {count}",
             "write for example episode_ends=[300, 600]",
+        )
+    if given[-1] == count - 1:
+        warn(
+            f"the last episode is a single state: each of episode_ends is the number of states up "
+            f"to an end, so that the last one is {count}, and no index"
         )
     return np.searchsorted(given, np.arange(count), side="right").astype(np.int32)

@@ -126,7 +126,7 @@ class Asking:
     def _askable(self) -> Expert:
         if self._expert is None:
             raise SettingError(
-                f"probes={self._run.probes and self._run.probes.describe()!r} without an expert",
+                f"probes {self._run.probes and self._run.probes.describe()} without an expert",
                 "an expert to ask, or a dataset with stored answers",
                 "pass the expert, or probes=0 for plain behaviour cloning",
             )

@@ -42,7 +42,7 @@ from fdtasil.run.judging import check_history
 from fdtasil.run.lesson import Lesson
 from fdtasil.run.report import config_of, no_answer, report_of
 from fdtasil.run.rounds import Rounds
-from fdtasil.run.subject import Subject, history_with, named, open_subject, visible
+from fdtasil.run.subject import Subject, bounded, history_with, named, open_subject, visible
 from fdtasil.run.training import Training
 from fdtasil.seeding import episode_seeds
 from fdtasil.student.architectures import Architecture
@@ -203,7 +203,9 @@ def distill(
         layout = subject.spaces.observations if subject.spaces else None
         student_obs = named(student_obs, layout)
         student_obs = visible(student_obs, subject.observation_size, subject.remembered)
-        arguments = replace(arguments, student_obs=student_obs)
+        if given is not None and subject.pool is not None:
+            given = bounded(given, subject.pool)
+        arguments = replace(arguments, given=given, student_obs=student_obs)
         run, bars = arguments.configure(subject, going_on), Progress(progress)
         run.check_spread()
         run.check_budget()

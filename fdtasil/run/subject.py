@@ -2,12 +2,14 @@
 
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain
+
+import numpy as np
 
 from fdtasil.checks import spelt
 from fdtasil.demonstrations.dataset import Dataset
-from fdtasil.errors import SettingError
+from fdtasil.errors import SettingError, warn
 from fdtasil.experts.carrying import carry
 from fdtasil.experts.expert import Expert
 from fdtasil.experts.load import ExpertLike, expert_in, load_expert
@@ -18,7 +20,7 @@ from fdtasil.rollouts.naming import columns_named
 from fdtasil.rollouts.spaces import Layout, Spaces
 from fdtasil.student.view import StudentObservation, describe_view
 
-__all__ = ["Subject", "history_with", "named", "open_subject", "visible"]
+__all__ = ["Subject", "bounded", "history_with", "named", "open_subject", "visible"]
 
 
 @dataclass(frozen=True)
@@ -110,6 +112,21 @@ def open_subject(
                 )
         size = n + past + remembered
         yield Subject(opened, pool, name, size, m, history, past, remembered, spaces)
+
+
+def bounded(given: Dataset, pool: EnvironmentPool) -> Dataset:
+    """Return a dataset with the environment's bounds of those actions that it has none of."""
+    low, high = (
+        np.where(np.isfinite(theirs), theirs, ours).astype(np.float32)
+        for theirs, ours in ((given.low, pool.boxes.low), (given.high, pool.boxes.high))
+    )
+    if not (np.allclose(low, pool.boxes.low) and np.allclose(high, pool.boxes.high)):
+        warn(
+            f"the dataset's action bounds are {low.tolist()} to {high.tolist()}, those of "
+            f"{pool.name} {pool.boxes.low.tolist()} to {pool.boxes.high.tolist()}: the student "
+            "stays within the dataset's"
+        )
+    return replace(given, low=low, high=high)
 
 
 def history_with(history: int, given: Dataset | None) -> int:
