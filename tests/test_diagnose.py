@@ -4,6 +4,7 @@ import json
 
 import gymnasium
 import numpy as np
+import onnx
 import pytest
 from conftest import GAIN, TOY, mlp_onnx
 from scipy.stats import spearmanr
@@ -18,6 +19,7 @@ from fdtasil.results.stability import Law, stability_of
 from fdtasil.rollouts.behaviours import follow
 from fdtasil.rollouts.environments import EnvironmentPool
 from fdtasil.rollouts.rollout import rollout
+from fdtasil.shell.gains import command as gains_command
 
 STIFFNESS = 0.2
 SIZES = (1e-3, 3e-3, 1e-2, 3e-2)
@@ -473,3 +475,31 @@ def test_what_is_no_such_simulator_has_no_linearised_loop():
 
 def early(rows):
     return lqr(rows[:, :4])
+
+
+@pytest.mark.fault(280)
+def test_a_law_of_steps_is_said_to_be_one():
+    """Near its states nothing changes: it would look smoother than any network."""
+    stairs = lambda rows: np.round(4 * lqr(rows)) / 4  # noqa: E731
+    found = fdtasil.diagnose(stairs, stairs, "InvertedPendulum-v5", episodes=2, horizon=30)
+    assert found.regime == "steps"
+    assert found.conditions == ()
+    assert found.errors is None
+    assert "the expert answers in steps" in str(found)
+    smooth = fdtasil.diagnose(lqr, lqr, "InvertedPendulum-v5", episodes=2, horizon=30)
+    assert smooth.regime == "smooth"
+    assert "in steps" not in str(smooth)
+
+
+@pytest.mark.fault(280)
+def test_gains_of_steps_are_said_to_be_none(tmp_path, capsys):
+    text = """<ir_version: 8, opset_import: ["" : 17]> law (float[N, 4] x) => (float[N, 1] y) {
+        w = Constant <value = float[4, 1] {40.0, 680.0, 80.0, 120.0}> ()
+        quarter = Constant <value = float[1] {0.01}> ()
+        sums = MatMul (x, w)
+        steps = Round (sums)
+        y = Mul (steps, quarter)
+    }"""
+    onnx.save(onnx.parser.parse_model(text), tmp_path / "steps.onnx")
+    gains_command(str(tmp_path / "steps.onnx"), "InvertedPendulum-v5", states=3, horizon=20)
+    assert "these are no derivatives" in capsys.readouterr().out

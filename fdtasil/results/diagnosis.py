@@ -14,6 +14,11 @@ from fdtasil.results.stability import Stability
 
 __all__ = ["Diagnosis"]
 
+_STEPS = (
+    "the expert answers in steps, so it has no derivatives: near its states nothing changes, and "
+    "farther away differences are of its jumps"
+)
+
 
 @dataclass(frozen=True)
 class Diagnosis:
@@ -40,7 +45,9 @@ class Diagnosis:
             the theorems ask for; None where no law was found, the expert has no answer around
             them, or not one coordinate moves, or more than 1,000.
         conditions: TaSIL's statements that are about such a loop, with these constants; none where
-            no law was found.
+            no law was found, or the expert answers in steps.
+        regime: How the expert answers: "smooth", "noisy" or "steps", as in `Calibration`; None
+            where it has no answers around its states.
     """
 
     fidelity: Fidelity
@@ -55,6 +62,7 @@ class Diagnosis:
     linearisation: Linearisation | None = None
     errors: Errors | None = None
     conditions: tuple[Condition, ...] = ()
+    regime: str | None = None
 
     def to_json(self) -> dict[str, Any]:
         """Return the diagnosis as plain JSON values; null for what is no number, or infinite."""
@@ -64,7 +72,10 @@ class Diagnosis:
         return f"<pre>{html.escape(str(self))}</pre>"
 
     def __str__(self) -> str:
-        lines = [*_of_fidelity(self.fidelity), *_of_stability(self.stability)]
+        lines = _of_fidelity(self.fidelity)
+        if self.regime == "steps":
+            lines.insert(1, _STEPS)
+        lines += _of_stability(self.stability)
         silent = f", not known at {self.unanswered:.0%} of it" if self.unanswered else ""
         lines.append(
             f"the student's largest error on its own path: {self.largest_error:.2g}{silent}"

@@ -26,7 +26,7 @@ class Evaluation:
         ci95: 95 % bootstrap interval of the normalised return, over paired episodes; None with it,
             or for a single pair. Of fewer than ten pairs it is too narrow.
         survival: Share of the student's episodes that neither the environment ended, nor a policy
-            without an answer.
+            that had no answer for too long.
         expert_survival: The same for the expert.
         action_error: Mean Euclidean distance of the student's action to the expert's, on the
             student's own states, in action units.

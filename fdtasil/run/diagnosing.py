@@ -1,6 +1,7 @@
 """Is it trained well enough, and what does the expert forgive: both are measured here."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -8,10 +9,11 @@ import torch
 
 from fdtasil.checks import check_count, check_flag
 from fdtasil.compute import torch_settings
-from fdtasil.errors import SettingError
+from fdtasil.errors import ExpertError, SettingError
 from fdtasil.experts.examination import examine
 from fdtasil.experts.expert import Expert
 from fdtasil.experts.load import ExpertLike, expert_in, sized
+from fdtasil.probes.calibration import calibrate
 from fdtasil.probes.scales import Scales, measure_scales
 from fdtasil.progress import Progress
 from fdtasil.results.conditions import conditions_of, errors_of
@@ -35,6 +37,7 @@ from fdtasil.run.judging import (
     judged_through,
     warn_of_another_environment,
 )
+from fdtasil.run.presets import PRESETS
 from fdtasil.run.subject import visible
 from fdtasil.seeding import episode_seeds, generator
 from fdtasil.student.view import StudentObservation, View, view_size
@@ -62,7 +65,7 @@ def diagnose(
 
     Nothing is trained, and the student may be anybody's: a result or the folder of a run, an ONNX
     file, a function.
-    The expert is asked some ten thousand times beside its episodes, and 48 times more for each
+    The expert is asked some eleven thousand times beside its episodes, and 48 times more for each
     coordinate where its loop follows a law.
 
     What it can't say: the fitted law is of these starts, these steps and these disturbances.
@@ -217,7 +220,8 @@ class _Loops:
         looked = sorted({0, steps // 2, steps - 1})
         with simulator_warnings():
             loops = linearise(pool, answers, self.act, self.starts[:_LOOKED], looked)
-        law, errors = stability.law, None
+        regime = self._regime(own)
+        law, errors = None if regime == "steps" else stability.law, None
         if law is not None:
             random = generator(self.seed, "directions of the theorems")
             errors = errors_of(ours, theirs, first.spread(_NORMED), units, scales, random, held)
@@ -226,7 +230,7 @@ class _Loops:
             stability,
             largest,
             stability.reached(largest) if largest else None,
-            law.gamma(largest) if law and largest else None,
+            stability.law.gamma(largest) if stability.law and largest else None,
             float(distances(first, path, scales).max()),
             int((path.lengths < first.lengths).sum()),
             unanswered,
@@ -234,7 +238,18 @@ class _Loops:
             loops,
             errors,
             conditions_of(errors, law) if errors and law else (),
+            regime,
         )
+
+    def _regime(self, own: Episodes) -> str | None:
+        """Return how the expert answers; None where it has no answers around its states."""
+        random, visited = generator(self.seed, "calibration"), own.observations[own.valid]
+        usual = PRESETS["standard"].radius
+        with suppress(ExpertError):
+            return calibrate(
+                self.expert, visited, self.scales, random, usual, units=self.units
+            ).regime
+        return None
 
     def _inside(self, policy: Policy) -> Policy:
         """Return a policy whose actions are what the environment takes them for."""

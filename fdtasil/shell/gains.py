@@ -18,6 +18,8 @@ from fdtasil.shell.command import EnvironmentId, ExpertPath
 
 __all__ = ["command"]
 
+_UNSURE = 0.3  # error, as a share of the Jacobian, above which nothing is left of it
+
 
 def command(
     expert: ExpertPath,
@@ -68,14 +70,17 @@ def command(
         scale = measure_scales(visited).units
         chosen = looked.own.spread(min(states, len(visited)))
         found = gains(asked, chosen, scale=scale, seed=seed)
-    print(_summary(found))
+        held = list(pool.spaces.observations.held)
+    print(_summary(found, held))
     if file is not None:
         write_bytes(file, _packed(chosen, found))
         print(f"written: {file}")
 
 
-def _summary(found: Gains) -> str:
+def _summary(found: Gains, held: list[int]) -> str:
+    """Return what was found; coordinates that are choices have no derivative worth a line."""
     sizes = np.sqrt(np.nanmean((found.jacobian * found.scale) ** 2, axis=0))
+    sizes[:, held] = 0.0
     rows = [
         ("states", f"{len(found.jacobian)}, Jacobians of {sizes.shape[0]} x {sizes.shape[1]}"),
         ("radius", f"{found.radius:.2g} standard deviations of each coordinate"),
@@ -83,6 +88,10 @@ def _summary(found: Gains) -> str:
         ("noise", f"{float(found.noise_floor.max()):.1e} in an action, at most"),
         ("queries", f"{found.queries:,}"),
     ]
+    if found.relative_error > _UNSURE:
+        rows.append(
+            ("note", "these are no derivatives: the expert answers in steps, or with noise")
+        )
     strongest = np.argsort(sizes, axis=None)[::-1][:5]
     for action, coordinate in zip(*np.unravel_index(strongest, sizes.shape), strict=True):
         about = f"{sizes[action, coordinate]:.3g} for each standard deviation"

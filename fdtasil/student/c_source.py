@@ -55,11 +55,24 @@ def c_header(policy: PlainPolicy, order: str = "") -> str:
         f"/* Written by fdtasil.{told}*/\n"
         "#ifndef STUDENT_H\n#define STUDENT_H\n\n"
         f"#define STUDENT_OBSERVATIONS {n}\n#define STUDENT_ACTIONS {m}\n\n"
-        "/* Raw observation -> action in the environment's units. Not reentrant: its buffers are\n"
-        "   static. */\n"
+        f"/* {_answer(policy)}\n"
+        "   Not reentrant: its buffers are static. */\n"
         "void student(const float observation[STUDENT_OBSERVATIONS],\n"
         "             float action[STUDENT_ACTIONS]);\n\n"
         "#endif\n"
+    )
+
+
+def _answer(policy: PlainPolicy) -> str:
+    """Return what the function answers, for a comment."""
+    if not policy.choices:
+        return "Raw observation -> action in the environment's units."
+    told = (
+        f"{first} + the place of the largest of action[{start}] to action[{stop - 1}]"
+        for start, stop, first in policy.choices
+    )
+    return "Raw observation -> scores, in place of actions. What is chosen:\n   " + (
+        ";\n   ".join(told) + "."
     )
 
 

@@ -7,6 +7,7 @@ it out for a robot. There:
 
     policy = PlainPolicy.load("student.safetensors")
     action = policy(observation)  # (n,) -> (m,), or (B, n) -> (B, m)
+    choice = policy.choose(observation)  # where actions are choices, of which those are scores
 """
 
 import json
@@ -121,7 +122,7 @@ class PlainPolicy:
         return np.stack(best, axis=-1)
 
     def __call__(self, observation: np.ndarray) -> np.ndarray:
-        """(n,) or (B, n) raw observations -> (m,) or (B, m) float32 actions."""
+        """(n,) or (B, n) raw observations -> (m,) or (B, m) float32 actions; scores of choices."""
         value = np.asarray(observation)
         if value.shape[-1:] != self.mean.shape:  # one number would be taken for all of them
             raise ValueError(f"observations of shape {value.shape}, not (..., {len(self.mean)})")
