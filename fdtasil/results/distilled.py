@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from fdtasil.checks import check_path
 from fdtasil.demonstrations.dataset import Dataset, check_shapes
 from fdtasil.demonstrations.states import Demonstrations
 from fdtasil.errors import first_line, warn
@@ -139,7 +140,7 @@ class Distilled:
                 differ from torch's by more than 1e-5.
             StorageError: If it can't be written.
         """
-        write_bytes(Path(path), self.export_bytes(path, inputs))
+        write_bytes(check_path("path", path), self.export_bytes(path, inputs))
         return Path(path)
 
     def to_onnx(self, path: str | Path) -> Path:
@@ -188,7 +189,7 @@ class Distilled:
                 files stay whole.
         """
         self.export_bytes("student.safetensors")  # what is spoilt is refused before all else
-        place = Path(folder).absolute()
+        place = check_path("folder", folder).absolute()
         check_free(place)
         with locked(place, _PATIENCE):
             write_run(self, place)

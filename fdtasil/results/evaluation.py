@@ -46,6 +46,8 @@ class Evaluation:
         expert_roughness: The same for the expert.
         high_frequency: Share of the power of the student's actions that is fast.
         expert_high_frequency: The same for the expert.
+        given_up: Episodes of the student that were ended, for it had no answer for too long.
+        expert_given_up: The same for the expert: its returns are of shorter episodes then.
     """
 
     episodes: int
@@ -69,6 +71,8 @@ class Evaluation:
     expert_roughness: float | None = None
     high_frequency: float | None = None
     expert_high_frequency: float | None = None
+    given_up: int = 0
+    expert_given_up: int = 0
 
     def to_json(self) -> dict[str, Any]:
         """Return the evaluation as plain JSON values."""
@@ -99,7 +103,15 @@ class Evaluation:
             f"  student           {student}\n"
             f"  normalised return {share}\n"
             f"  action error      {self.action_error:10.3f}   on the student's own states"
-            f"{same}{self._rough()}{kept}"
+            f"{same}{self._rough()}{kept}{self._cut()}"
+        )
+
+    def _cut(self) -> str:
+        cut = (("expert", self.expert_given_up), ("student", self.given_up))
+        return "".join(
+            f"\n  cut short         {count:10}   episodes, for the {who} had no answer for long"
+            for who, count in cut
+            if count
         )
 
     def _rough(self) -> str:
@@ -135,6 +147,9 @@ def evaluation_rows(found: Evaluation) -> list[tuple[str, str]]:
     if found.roughness is not None and found.expert_roughness is not None:
         told = f"{found.roughness:.3g}, the expert's {found.expert_roughness:.3g}"
         rows.append(("change of an action in a step", told))
+    for who, cut in (("expert", found.expert_given_up), ("student", found.given_up)):
+        if cut:
+            rows.append(("cut short", f"{cut} episodes, for the {who} had no answer for long"))
     for name, theirs, ours in found.violations:
         rows.append((f"{name} violated", f"{ours:.2%} of the steps, the expert {theirs:.2%}"))
     return rows

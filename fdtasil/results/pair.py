@@ -83,6 +83,8 @@ def evaluate_pair(
         expert_roughness=their_smoothness.roughness,
         high_frequency=our_smoothness.high_frequency,
         expert_high_frequency=their_smoothness.high_frequency,
+        given_up=int(student_episodes.given_up.sum()),
+        expert_given_up=int(expert_episodes.given_up.sum()),
     )
 
 

@@ -311,6 +311,13 @@ def _time_limit(environment: gymnasium.Env) -> int | None:
 
 
 def _spaces_of(environment: gymnasium.Env | Together, name: str) -> Spaces:
+    for role in ("observation_space", "action_space"):
+        if getattr(environment, role, None) is None:
+            raise EnvironmentFault(
+                f"{name} has no {role}",
+                "both spaces, as attributes",
+                f"write self.{role} = gymnasium.spaces.Box(low, high, (size,)) in its __init__",
+            )
     try:
         return Spaces.of(environment)
     except UnknownSpace as unknown:

@@ -1,5 +1,7 @@
 """A student that sees the last observations and actions, with a buffer of its own."""
 
+from collections.abc import Mapping
+
 import numpy as np
 
 from fdtasil.checks import check_count
@@ -68,6 +70,12 @@ class History:
         """
         if episode_start:
             self._window.clear()
+        if isinstance(observation, Mapping | tuple):
+            raise SettingError(
+                f"an observation that is a {type(observation).__name__}",
+                f"({self.observation_size},), its flat form",
+                "pass result.dataset.spaces.observations.row(observation)",
+            )
         seen, n = np.asarray(observation, np.float32), self.observation_size
         if seen.shape != (n,):
             raise SettingError(
