@@ -267,6 +267,7 @@ FAULTS = {
         275: "a function that is the identity at demonstrated states, and not where probes lead",
         276: "directions that move a part of the coordinates, in the weight of the loss",
         277: "episodes of other lengths, in one spectrum",
+        281: "chance that few rows do not show, taken for the size of a batch",
         280: "a law of steps, which is flat where it is looked at nearly",
     },
     "what is silently another thing": {

@@ -353,9 +353,10 @@ def test_a_run_goes_on_where_it_was_begun_or_where_it_is_told_to(inside, tmp_pat
 @pytest.mark.slow
 def test_a_module_of_the_current_folder_and_a_warning_without_source(expert, tmp_path):
     """As the installed command, which does not look into the current folder by itself."""
+    (tmp_path / "theirs.py").write_text("from toy_environments import Integrator\n")
     (tmp_path / "mine.py").write_text(
-        "import gymnasium, toy_environments as toys\n"
-        "gymnasium.register('My-v0', entry_point=toys.Integrator, max_episode_steps=15)\n"
+        "import gymnasium\n"
+        "gymnasium.register('My-v0', entry_point='theirs:Integrator', max_episode_steps=15)\n"
     )
     start = "import sys; sys.path.remove(''); from fdtasil.shell.main import main; main()"
     command = [sys.executable, "-c", start, "distill", str(expert), "mine:My-v0", *QUICK]

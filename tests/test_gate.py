@@ -95,6 +95,22 @@ def test_a_factory_that_hands_out_one_environment_is_used_one_episode_at_a_time(
     assert np.allclose(found, expected, atol=1e-5)
 
 
+@pytest.mark.fault(281)
+def test_chance_that_few_rows_did_not_show_is_not_taken_for_the_size_of_a_batch():
+    """With `batch=16` as advice, the check that found it would be gone."""
+    random = np.random.default_rng(0)
+
+    def rare(rows):
+        answers = rows @ GAIN.T
+        if len(rows) > 100:  # so seldom that few rows are spared
+            answers[random.random(len(rows)) < 0.02] = 0
+        return answers
+
+    with pytest.raises(ExpertError, match=r"asked the same [\d,]+ observations twice") as caught:
+        fdtasil.distill(rare, TOY, 50, **QUICK)
+    assert "batch=" not in caught.value.next_step
+
+
 def test_a_half_bounded_action_does_not_switch_the_checks_off():
     boxes = Boxes(5, np.full(2, -np.inf, np.float32), np.ones(2, np.float32))
     rows = np.random.default_rng(0).standard_normal((16, 5)).astype(np.float32)

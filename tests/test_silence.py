@@ -161,6 +161,22 @@ def test_an_expert_with_too_few_answers_is_an_error():
         )
 
 
+def test_episodes_that_were_cut_short_are_said_beside_the_returns():
+    """Where all of the expert's are, their returns are no measure."""
+
+    def lost(rows):
+        answers = rows @ GAIN.T
+        answers[rows[:, 0] > 0.5] = np.nan
+        return answers
+
+    always = lambda rows: rows @ GAIN.T  # noqa: E731
+    with pytest.warns(fdtasil.FdtasilWarning, match="episodes of the expert were ended"):
+        found = fdtasil.evaluate(always, lost, TOY, episodes=6, horizon=40, force=True)
+    assert found.given_up == 0 < found.expert_given_up < 6
+    assert f"cut short         {found.expert_given_up:10}   episodes, for the expert" in str(found)
+    assert "cut short" in found._repr_html_()
+
+
 def test_the_last_action_is_held_for_a_while_and_then_the_episode_ends():
     steps = []
 

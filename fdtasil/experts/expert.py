@@ -278,7 +278,7 @@ class Expert:
             raise ExpertError(
                 f"{self.name} answered {rows.shape} observations with shape {answer.shape}",
                 expected,
-                "return one row of actions for each row of observations",
+                _advice(answer),
             )
         infinite = np.asarray(np.isinf(answer).any(axis=1))
         if infinite.any():
@@ -290,7 +290,10 @@ class Expert:
         """What it is called with, for who called it wrongly."""
         layout = self.spaces.observations if self.spaces and self.own_form else None
         if layout is None or layout.plain:
-            return "experts answer (B, n) with (B, m)"
+            return (
+                "experts answer (B, n) with (B, m), one of a single state by "
+                "lambda rows: np.array([f(row) for row in rows])"
+            )
         parts = [
             f"{p.name or 'an array'} (B, {', '.join(map(str, p.shape))})" for p in layout.parts
         ]
@@ -298,6 +301,17 @@ class Expert:
 
     def _has_action_size(self, answer: np.ndarray) -> bool:
         return self.action_size is None or answer.shape[1] == self.action_size
+
+
+def _advice(answer: np.ndarray) -> str:
+    """Return what to do about answers of another shape."""
+    if answer.ndim < 2 and np.isnan(answer).all():
+        return "in the place of None, return a row of NaN for each row that has no answer"
+    if answer.ndim == 1:
+        return (
+            "return one row of actions for each row of observations: found[:, None] of one action"
+        )
+    return "return one row of actions for each row of observations"
 
 
 class _Raised(Exception):

@@ -60,7 +60,8 @@ def open_onnx(source: str | Path, hints: Hints) -> Expert:
         raise ExpertError(
             f"{path}, which is no ONNX file",
             "an .onnx file, an agent's .zip, or a .c file",
-            "of a student, take the student.onnx beside it",
+            "of a student, take the student.onnx beside it; a function is passed in Python: "
+            "fdtasil.distill(function, ...)",
         )
     model, digest = read_model(path)
     columns = _columns(model, path)

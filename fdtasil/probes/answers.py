@@ -194,12 +194,14 @@ def ask_moved(expert: Expert, points: np.ndarray, purpose: Purpose) -> np.ndarra
     try:
         return expert.ask(points, purpose)
     except ExpertError as error:
-        raise ExpertError(
-            f"{error.found} (states moved by probes)",
-            error.expected,
-            f"{error.next_step}; probes leave the bounds of the observations, so it must answer "
-            "there as well, or the radius be smaller",
-        ) from error
+        beyond = (
+            "; probes leave the bounds of the observations, so it must answer there as well, or "
+            "the radius be smaller"
+        )
+        # A connection that broke says nothing of states.
+        step = error.next_step + ("" if isinstance(error.__cause__, OSError) else beyond)
+        found = f"{error.found} (states moved by probes)"
+        raise ExpertError(found, error.expected, step) from error
 
 
 def _ask_values(

@@ -124,7 +124,7 @@ def _checked(states: object) -> np.ndarray:
         raise SettingError(
             f"{spelt('states', states)[:80]}",
             "(N, n) finite observations",
-            "pass for example result.dataset.demonstrations.observations[:10]",
+            "pass for example result.demonstrations.observations[:10]",
         ) from None
     return rows
 

@@ -287,6 +287,9 @@ _NUMBERS: dict[str, Callable[[str], object]] = {
 }
 
 
+_NUMBERS_LIKE = {"radius": "radius=0.3, radius=0.2..2 or radius=wide", "per_step": "per_step=2"}
+
+
 def _describe(directions: Directions) -> str:
     count = getattr(directions, "probes", "")
     return f"{directions.name}:{'all' if count is None else count}".rstrip(":")
@@ -310,8 +313,13 @@ def _parse_text(spec: str) -> Probes:
         directions = design(*counts)
     except ValueError:  # no number, or none that can be used
         raise SettingError(f"probes={spec!r}", _GRAMMAR, _EXAMPLES) from None
+    told: dict[str, str] = {}
     for option in options:
-        fields |= _parse_option(option, spec)
+        (field, value), *_ = _parse_option(option, spec).items()
+        if field in told and fields[field] != value:
+            found = f"probes={spec!r}: {told[field]!r} beside {option!r}"
+            raise SettingError(found, "one of the two", "leave one out")
+        fields[field], told[field] = value, option
     if directions.exact and "stencil" in fields:
         raise SettingError(f"probes={spec!r}", "no stencil: the derivative is exact", _EXAMPLES)
     return Probes(directions, **fields)
@@ -321,10 +329,12 @@ def _parse_option(option: str, spec: str) -> dict[str, object]:
     key, _, value = option.partition("=")
     if not value and key in _FLAGS:
         return dict([_FLAGS[key]])
+    known = ", ".join([*_FLAGS, *(f"{name}=..." for name in _NUMBERS)])
+    if key not in _NUMBERS:
+        found = f"probes={spec!r}: unknown option {option!r}"
+        raise SettingError(found, f"one of {known}", _EXAMPLES)
     try:
         return {key: _NUMBERS[key](value)}
-    except (KeyError, ValueError):
-        known = ", ".join([*_FLAGS, *(f"{name}=..." for name in _NUMBERS)])
-        raise SettingError(
-            f"probes={spec!r}: unknown option {option!r}", f"one of {known}", _EXAMPLES
-        ) from None
+    except ValueError:
+        found, example = f"probes={spec!r}: {value!r} in {option!r}", _NUMBERS_LIKE[key]
+        raise SettingError(found, f"{key}= with a number", f"write {example}") from None

@@ -35,7 +35,8 @@ def run_rows(report: Mapping[str, Any]) -> Rows:
         rows.append(("why", report["probes_chosen"]))
     rows += [
         ("queries", rows_text(report["queries"]) or "none"),
-        ("training", f"{report['steps']:,} steps, {report['train_seconds']:,.0f} s"),
+        ("training", f"{report['steps']:,} steps"),
+        ("seconds", f"{report['train_seconds']:,.0f}, recording and queries included"),
         *((f"size of the {name}", size_text(size)) for name, size in sizes.items()),
         ("seed", str(report["seed"])),
         ("versions", ", ".join(f"{name} {text}" for name, text in report["versions"].items())),

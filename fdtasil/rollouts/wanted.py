@@ -83,11 +83,11 @@ class Environment:
 
 
 def import_module_of(environment: str | None) -> None:
-    """Import the module of "module:Id" where it lies in the current folder.
+    """Import the module of "module:Id", and that of its environment, from the current folder.
 
     Nothing else is looked for there: a folder that somebody else filled runs no code by itself.
     """
-    module, named, _ = (environment or "").partition(":")
+    module, named, name = (environment or "").partition(":")
     here = os.getcwd()
     if not named or here in sys.path:
         return
@@ -95,5 +95,8 @@ def import_module_of(environment: str | None) -> None:
     try:
         with suppress(ImportError):  # gymnasium says what is missing
             importlib.import_module(module)
+            known = gymnasium.registry.get(name)
+            if known is not None and isinstance(known.entry_point, str):
+                importlib.import_module(known.entry_point.partition(":")[0])
     finally:
         sys.path.remove(here)

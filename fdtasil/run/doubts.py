@@ -87,7 +87,7 @@ def warn_of_silence(shares: Mapping[str, float], reason: str, given_up: int) -> 
     if not shares:
         return
     where = ", ".join(f"{name} {share:.2g}" for name, share in shares.items())
-    ended = f"; {given_up} episodes ended for it" if given_up else ""
+    ended = f"; {given_up} episode{'s' * (given_up > 1)} ended for it" if given_up else ""
     warn(
         f"the expert had no answer to some rows (shares: {where}), which are left out{ended}; the "
         f"last time it said {reason}"

@@ -3,6 +3,8 @@
 from pathlib import Path
 from typing import Literal
 
+import numpy as np
+
 from fdtasil.checks import check_count, check_suffix
 from fdtasil.errors import printable, without_secrets
 from fdtasil.experts.examination import Looked, look_closely
@@ -19,6 +21,7 @@ from fdtasil.shell.command import EnvironmentId, ExpertPath
 
 __all__ = ["command"]
 
+_SHOWN = 6  # bounds that differ
 _CHANCE = "  (no worse than the expert: does it belong to this environment and version?)"
 
 
@@ -106,7 +109,15 @@ def _actions(pool: EnvironmentPool) -> str:
     if choices:
         counts = ", ".join(str(stop - start) for start, stop in choices)
         return f"{boxes.action_size} scores of choices, of {counts} each"
-    return f"{boxes.action_size}, from {boxes.low.min():g} to {boxes.high.max():g}"
+    return f"{boxes.action_size}, from {_ends(boxes.low)} to {_ends(boxes.high)}"
+
+
+def _ends(bounds: np.ndarray) -> str:
+    """Return one number where all are equal, else the first of them."""
+    if (bounds == bounds[0]).all():
+        return f"{bounds[0]:g}"
+    more = ", ..." if len(bounds) > _SHOWN else ""
+    return f"[{', '.join(f'{bound:g}' for bound in bounds[:_SHOWN])}{more}]"
 
 
 def _calibrated(looked: Looked, pool: EnvironmentPool, seed: int) -> Calibration | None:

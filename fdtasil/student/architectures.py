@@ -110,12 +110,13 @@ def check_architecture(student: object) -> Architecture:
     Raises:
         SettingError: If it is none that files can name.
     """
-    if isinstance(student, str):
-        return PRESETS[check_choice("student", student, PRESETS)]
+    if isinstance(student, str) and student in PRESETS:
+        return PRESETS[student]
     made = student() if isinstance(student, type) and _is_known(student) else student
     if _is_known(type(made)):
         return made  # pyright: ignore[reportReturnType]
-    known = ", ".join(getattr(kind, "__name__", name) for name, kind in ARCHITECTURES.items())
+    kinds = [getattr(kind, "__name__", name) for name, kind in ARCHITECTURES.items()]
+    known = ", ".join([*kinds, *(f'"{name}"' for name in PRESETS)])
     raise SettingError(
         spelt("student", student), known, "write for example student=fdtasil.Mlp((64, 64))"
     )

@@ -118,6 +118,14 @@ def _read_bytes(path: Path) -> bytes:
             "name the file itself",
         )
     beside = [p.name for p in (path.with_name(f"{path.name}{end}") for end in _ENDS) if p.exists()]
-    shipped = "check the path; `fdtasil experts` lists the shipped ones, and fetches them"
-    hint = f"name it whole: {beside[0]}" if beside else shipped
+    hint = f"name it whole: {beside[0]}" if beside else _MISSING
+    if ":" in str(path) and not path.exists():
+        hint = _ADDRESS
     return read_limited(path, _SIZE_LIMIT, "an ONNX file", hint)
+
+
+_MISSING = "check the path; `fdtasil experts` lists the shipped ones, and fetches them"
+_ADDRESS = (
+    "an address begins with http://, https:// or hf://; a function is passed in Python: "
+    "fdtasil.distill(function, ...)"
+)

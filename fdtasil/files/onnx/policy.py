@@ -263,6 +263,8 @@ def _choose_output(
             f"one floating-point output (batch, {action_size or 'm'})",
             'name it: load_expert(path, output="...") (--output on the command line)'
             if fitting
+            else 'convert it with options={"zipmap": False}'
+            if any(entry.type.startswith("seq(") for entry in outputs)
             else "check that expert and environment belong together",
         )
     return fitting[0]

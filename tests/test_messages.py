@@ -1,0 +1,92 @@
+"""What is said to who makes a usual mistake for the first time: it names the way out."""
+
+import gymnasium
+import numpy as np
+import pytest
+from conftest import GAIN, QUICK, TOY
+
+import fdtasil
+from fdtasil.errors import EnvironmentFault, FdtasilError
+
+pytestmark = pytest.mark.usefixtures("no_pictures")
+
+STATES = np.zeros((4, 5), np.float32)
+
+
+def asked(answer):
+    return lambda: fdtasil.load_expert(lambda rows: answer, 5, 2).ask(STATES, "act")
+
+
+def one_state(row):
+    return GAIN @ row
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (asked(None), "a row of NaN"),
+        (asked([None]), "a row of NaN"),
+        (asked(np.zeros(4)), r"found\[:, None\]"),
+        (lambda: fdtasil.load_expert(one_state, 5, 2).ask(STATES, "act"), "for row in rows"),
+        (lambda: fdtasil.load_expert("mpc.py"), r"fdtasil.distill\(function"),
+        (lambda: fdtasil.load_expert("mpc:plan"), r"fdtasil.distill\(function"),
+        (lambda: fdtasil.load_expert("127.0.0.1:8000/act"), "begins with http://"),
+        (lambda: fdtasil.load_expert("ws://localhost:8000/act"), "begins with http://"),
+        (lambda: fdtasil.distill(len, TOY, "4,central,forward"), "'central' beside 'forward'"),
+        (lambda: fdtasil.distill(len, TOY, "4,labels,both"), "'labels' beside 'both'"),
+        (lambda: fdtasil.distill(len, TOY, "4,radius=abc"), "write radius=0.3"),
+        (lambda: fdtasil.distill(len, TOY, student="small"), r"fdtasil.Mlp\(\(64, 64\)\)"),
+        (lambda: fdtasil.distill(len, TOY, resume="nowhere"), "nothing was"),
+    ],
+)
+def test_the_way_out_is_named(call, said, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(FdtasilError, match=said) as caught:
+        call()
+    assert len(str(caught.value).splitlines()) <= 6
+
+
+@pytest.mark.parametrize("option", ["central,central", "labels,labels,radius=0.3"])
+def test_an_option_may_be_said_twice(option):
+    fdtasil.distill(lambda rows: rows @ GAIN.T, TOY, f"2,{option}", **QUICK)
+
+
+@pytest.mark.parametrize("missing", ["observation_space", "action_space"])
+def test_an_environment_without_a_space(missing):
+    class Bare(gymnasium.Env):
+        observation_space = gymnasium.spaces.Box(-1, 1, (5,))
+        action_space = gymnasium.spaces.Box(-1, 1, (2,))
+
+    delattr(Bare, missing)
+    with pytest.raises(EnvironmentFault, match=f"no {missing}") as caught:
+        fdtasil.distill(lambda rows: rows @ GAIN.T, Bare, **QUICK)
+    assert f"self.{missing} = gymnasium.spaces.Box" in caught.value.next_step
+
+
+def test_a_server_that_is_gone_is_no_matter_of_the_radius():
+    class Gone:
+        def __init__(self):
+            self.asked = 0
+
+        def __call__(self, rows):
+            self.asked += 1
+            if len(rows) > 100 and self.asked > 60:
+                raise ConnectionRefusedError("refused")
+            return rows @ GAIN.T
+
+    with pytest.raises(FdtasilError, match="ConnectionRefusedError") as caught:
+        fdtasil.distill(Gone(), TOY, 10, **QUICK)
+    assert "radius" not in caught.value.next_step
+
+
+@pytest.mark.parametrize("call", [lambda r: r.save(None), lambda r: r.export(None)])
+def test_no_path_is_no_path(call, quick):
+    with pytest.raises(FdtasilError, match="=None"):
+        call(quick)
+
+
+def test_a_dictionary_in_the_place_of_the_numbers_of_a_history(quick):
+    run = {**QUICK, "history": 2}
+    result = fdtasil.distill(lambda rows: rows @ GAIN.T, TOY, 0, **run)
+    with pytest.raises(FdtasilError, match="an observation that is a dict"):
+        fdtasil.History(result.student, 2).predict({"speed": np.zeros(5)})
