@@ -57,7 +57,7 @@ def test_the_shell_has_the_functions_arguments_and_defaults(name):
         "constraints",
     }
     added = {"output", "inputs", "trust", "env_kwargs", "reset_options"}
-    numbers = {"num_envs"}
+    numbers = {"num_envs", "json"}
     if name == "distill":
         added |= {"out", "baseline", "log_formats"} | SETTINGS
     assert set(command) - set(function) <= added | numbers
@@ -369,6 +369,21 @@ def test_a_module_of_the_current_folder_and_a_warning_without_source(expert, tmp
         assert promised in done.stdout
     picture = tmp_path / "runs" / "latest" / "figures" / "training.png"
     assert picture.read_bytes().startswith(b"\x89PNG")
+
+
+def test_what_was_found_is_written_for_a_script(expert, inside, tmp_path):
+    short = ["--expert", expert, "--episodes", 2, "--horizon", 20]
+    for command in ("evaluate", "diagnose"):
+        found = tmp_path / f"{command}.json"
+        done = inside(command, expert, TOY, *short, "--json", found, cwd=tmp_path)
+        assert done.returncode == 0, done.stderr
+        assert f"written: {found.name}" in done.stdout
+        plain = json.loads(found.read_text(), parse_constant=float)
+        assert plain.keys() >= {"evaluate": {"ci95"}, "diagnose": {"fidelity"}}[command]
+        assert "NaN" not in found.read_text()
+    refused = inside("evaluate", expert, TOY, *short, "--json", "x.csv", cwd=tmp_path)
+    assert refused.returncode == 2
+    assert "ends with .json" in refused.stderr
 
 
 def test_a_warning_is_one_line(expert, inside, tmp_path):

@@ -1,0 +1,43 @@
+"""What a command found: said to who reads, and written as JSON for a script."""
+
+import json
+from pathlib import Path
+from typing import Any, Protocol
+
+from fdtasil.checks import check_suffix
+from fdtasil.files.plain import without_infinities
+from fdtasil.files.storage import write_bytes
+from fdtasil.shell.command import OptionalPath
+
+__all__ = ["JSON_FLAG", "json_file", "say"]
+
+JSON_FLAG: dict[str, tuple[Any, Any, str]] = {
+    "json": (OptionalPath, None, "File that all of it is written into too, as JSON."),
+}
+"""Arguments of a command that finds something out."""
+
+
+class Found(Protocol):
+    """What can be printed and written."""
+
+    def to_json(self) -> dict[str, Any]:
+        """Return it as plain JSON values."""
+        ...
+
+
+def json_file(path: Path | None) -> Path | None:
+    """Return the file to write, before an environment may change the folder.
+
+    Raises:
+        SettingError: If its name ends otherwise.
+    """
+    return None if path is None else check_suffix(path, ".json").absolute()
+
+
+def say(found: Found, file: Path | None) -> None:
+    """Print what was found; write it, where there is a file from `json_file`."""
+    print(found)
+    if file is not None:
+        plain, _ = without_infinities(found.to_json())
+        write_bytes(file, json.dumps(plain, indent=2).encode())
+        print(f"written: {file.name}")
