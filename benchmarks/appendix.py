@@ -24,7 +24,17 @@ METHODS: dict[str, dict[str, Any]] = {
 }
 BUDGETS = (1, 2, 5, 10, 20)
 _SEEDS_TOLD = 2  # of a method that is told: a cell takes up to forty minutes
-PAIRS = (("1", "plain"), ("10", "1"), ("50", "1"), ("10", "jacobian"), ("50", "jacobian"))
+PAIRS = (
+    ("1", "plain"),
+    ("5", "plain"),
+    ("10", "plain"),
+    ("50", "plain"),
+    ("5", "1"),
+    ("10", "1"),
+    ("50", "1"),
+    ("10", "jacobian"),
+    ("50", "jacobian"),
+)
 
 
 def cells(quick: bool) -> list[Cell]:
