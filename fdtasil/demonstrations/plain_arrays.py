@@ -127,8 +127,8 @@ def _episodes(ends: Any, count: int) -> np.ndarray:
     if ends is None:
         return np.zeros(count, np.int32)
     given = np.asarray(ends)
-    said = f"episode_ends={np.array2string(given, threshold=6)}"
-    if given.dtype == bool and given.shape == (count,):
+    said, flags = f"episode_ends={np.array2string(given, threshold=6)}", given.dtype == bool
+    if flags and given.shape == (count,):
         given = np.flatnonzero(given) + 1
     good = given.ndim == 1 and given.size > 0 and given.dtype.kind in "iu"
     if not good or given[0] < 1 or given[-1] > count or not (np.diff(given) > 0).all():
@@ -137,9 +137,9 @@ def _episodes(ends: Any, count: int) -> np.ndarray:
             f"({count},) True at the last state of each episode, or growing numbers up to {count}",
             "write for example episode_ends=[300, 600]",
         )
-    if given[-1] == count - 1:
+    if given[-1] == count - 1 and not flags:
         warn(
-            f"the last episode is a single state: each of episode_ends is the number of states up "
+            "the last episode is a single state: each of episode_ends is the number of states up "
             f"to an end, so that the last one is {count}, and no index"
         )
     return np.searchsorted(given, np.arange(count), side="right").astype(np.int32)

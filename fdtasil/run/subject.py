@@ -117,8 +117,8 @@ def open_subject(
 def bounded(given: Dataset, pool: EnvironmentPool) -> Dataset:
     """Return a dataset with the environment's bounds of those actions that it has none of."""
     low, high = (
-        np.where(np.isfinite(theirs), theirs, ours).astype(np.float32)
-        for theirs, ours in ((given.low, pool.boxes.low), (given.high, pool.boxes.high))
+        np.where(np.isfinite(said), said, own).astype(np.float32)
+        for said, own in ((given.low, pool.boxes.low), (given.high, pool.boxes.high))
     )
     if not (np.allclose(low, pool.boxes.low) and np.allclose(high, pool.boxes.high)):
         warn(
