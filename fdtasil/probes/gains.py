@@ -21,6 +21,7 @@ _WINDOW = 2  # rungs below the best one that the error's law is fitted to; above
 _BEYOND = (16 / 9 / 5) ** 0.5
 _ROUNDING = float(np.finfo(np.float32).eps)
 _RATIO = 4.0  # of a rung to the one below it
+_UNSURE = 0.3  # error, as a share of the Jacobian, above which nothing is left of it
 
 
 @dataclass(frozen=True)
@@ -51,6 +52,24 @@ class Gains:
         if size == 0:
             return 0.0 if error == 0 else float("inf")
         return error / size
+
+    def __str__(self) -> str:
+        sizes = np.sqrt(np.nanmean((self.jacobian * self.scale) ** 2, axis=0))
+        rows = [
+            ("states", f"{len(self.jacobian)}, Jacobians of {sizes.shape[0]} x {sizes.shape[1]}"),
+            ("radius", f"{self.radius:.2g} standard deviations of each coordinate"),
+            ("error", f"{self.relative_error:.1%} of the Jacobian's norm, estimated"),
+            ("noise", f"{float(self.noise_floor.max()):.1e} in an action, at most"),
+            ("queries", f"{self.queries:,}"),
+        ]
+        if self.relative_error > _UNSURE:
+            told = "these are no derivatives: the expert answers in steps, or with noise"
+            rows.append(("note", told))
+        strongest = np.argsort(sizes, axis=None)[::-1][:5]
+        for action, coordinate in zip(*np.unravel_index(strongest, sizes.shape), strict=True):
+            about = f"{sizes[action, coordinate]:.3g} for each standard deviation"
+            rows.append((f"action {action}", f"coordinate {coordinate}: {about}"))
+        return "\n".join(f"{name:10} {text}" for name, text in rows)
 
 
 def gains(

@@ -115,9 +115,9 @@ def diagnose(
         visited = own.observations[own.valid]
         act = _acting(judged, student_obs, visited, pool)
         warn_of_another_environment(student, pool)
-        loops = _Loops(pool, asked, act, measure_scales(visited), _units(pool), starts, seed)
-        loops.check_movable()
-        return loops.diagnose(own, min(followed, length))
+        pair = _Pair(pool, asked, act, measure_scales(visited), _units(pool), starts, seed)
+        pair.check_movable()
+        return pair.diagnose(own, min(followed, length))
 
 
 def _check_numbers(pool: EnvironmentPool) -> None:
@@ -166,7 +166,7 @@ def _units(pool: EnvironmentPool) -> np.ndarray:
 
 
 @dataclass(frozen=True)
-class _Loops:
+class _Pair:
     """Expert and student in one environment.
 
     Attributes:

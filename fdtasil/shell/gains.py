@@ -1,6 +1,7 @@
 """`fdtasil gains`: the Jacobian of an expert at states of its own episodes."""
 
 import io
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
@@ -17,8 +18,6 @@ from fdtasil.shell.call import opened, wanted
 from fdtasil.shell.command import EnvironmentId, ExpertPath
 
 __all__ = ["command"]
-
-_UNSURE = 0.3  # error, as a share of the Jacobian, above which nothing is left of it
 
 
 def command(
@@ -70,33 +69,18 @@ def command(
         scale = measure_scales(visited).units
         chosen = looked.own.spread(min(states, len(visited)))
         found = gains(asked, chosen, scale=scale, seed=seed)
-        held = list(pool.spaces.observations.held)
-    print(_summary(found, held))
+        found = _without(found, list(pool.spaces.observations.held))
+    print(found)
     if file is not None:
         write_bytes(file, _packed(chosen, found))
         print(f"written: {file}")
 
 
-def _summary(found: Gains, held: list[int]) -> str:
-    """Return what was found; coordinates that are choices have no derivative worth a line."""
-    sizes = np.sqrt(np.nanmean((found.jacobian * found.scale) ** 2, axis=0))
-    sizes[:, held] = 0.0
-    rows = [
-        ("states", f"{len(found.jacobian)}, Jacobians of {sizes.shape[0]} x {sizes.shape[1]}"),
-        ("radius", f"{found.radius:.2g} standard deviations of each coordinate"),
-        ("error", f"{found.relative_error:.1%} of the Jacobian's norm, estimated"),
-        ("noise", f"{float(found.noise_floor.max()):.1e} in an action, at most"),
-        ("queries", f"{found.queries:,}"),
-    ]
-    if found.relative_error > _UNSURE:
-        rows.append(
-            ("note", "these are no derivatives: the expert answers in steps, or with noise")
-        )
-    strongest = np.argsort(sizes, axis=None)[::-1][:5]
-    for action, coordinate in zip(*np.unravel_index(strongest, sizes.shape), strict=True):
-        about = f"{sizes[action, coordinate]:.3g} for each standard deviation"
-        rows.append((f"action {action}", f"coordinate {coordinate}: {about}"))
-    return "\n".join(f"{name:10} {text}" for name, text in rows)
+def _without(found: Gains, held: list[int]) -> Gains:
+    """Leave out coordinates that are choices: nothing is between two of them."""
+    jacobian, error = found.jacobian.copy(), found.error.copy()
+    jacobian[..., held] = error[..., held] = 0.0
+    return replace(found, jacobian=jacobian, error=error)
 
 
 def _packed(states: np.ndarray, found: Gains) -> bytes:
