@@ -262,7 +262,7 @@ FAULTS = {
     },
     "what numbers say": {
         272: "a first pair of returns that are zero, in an interval",
-        273: "few pairs, some without a return of the expert above chance, in an interval",
+        273: "an interval beside an expert that is hardly above the reference",
         274: "an action in large units beside others, where an expert is measured or known again",
         275: "a function that is the identity at demonstrated states, and not where probes lead",
         276: "directions that move a part of the coordinates, in the weight of the loss",

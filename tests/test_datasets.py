@@ -302,6 +302,17 @@ def test_arrays_of_anybody_are_learnt_from(change, linear):
 
 
 @pytest.mark.fault(278)
+def test_reversed_arrays_are_differentiated_too():
+    law = torch.nn.Sequential(torch.nn.Linear(5, 2), torch.nn.Tanh())
+    given = fdtasil.distill(law, TOY, 0, **QUICK).dataset
+    states = given.demonstrations
+    turned = {name: array[::-1] for name, array in vars(states).items()}
+    other = replace(given, demonstrations=replace(states, **turned))
+    found = fdtasil.distill(law, probes="jacobian", dataset=other, **SMALL)
+    assert len(found.dataset.answers.values) == len(states)
+
+
+@pytest.mark.fault(278)
 def test_later_rounds_alone_are_learnt_from(linear):
     run = {**QUICK, "trainer": fdtasil.DAgger(updates=(1,))}
     given = fdtasil.distill(linear, TOY, 0, **run).dataset
@@ -431,6 +442,10 @@ def test_recorded_actions_beyond_their_bounds_are_warned_of(arrays, linear):
     states, actions = arrays
     with pytest.warns(FdtasilWarning, match=r"\d+ of 40 actions lie beyond low and high, by up"):
         fdtasil.from_arrays(states, actions, low=-0.1, high=0.1)
+    small = np.stack([actions[:, 0], np.full(40, 9e-3)], axis=1)  # beside one in large numbers
+    with pytest.warns(FdtasilWarning, match="40 of 40 actions lie beyond"):
+        fdtasil.from_arrays(states, small, low=[-1000, -1e-3], high=[1000, 1e-3])
+    fdtasil.from_arrays(states, -abs(actions), low=-5, high=0)
 
 
 @pytest.mark.fault(279)
@@ -438,15 +453,18 @@ def test_bounds_that_arrays_lack_are_the_environments(arrays, linear):
     states, actions = arrays
     run = {"probes": 0, "horizon": 5, "evaluation_episodes": 2, **SMALL}
     free = fdtasil.from_arrays(states, actions)
-    result = fdtasil.distill(linear, TOY, dataset=free, **run)
+    with pytest.warns(FdtasilWarning, match=r"\d+ of 40 actions lie beyond low and high"):
+        result = fdtasil.distill(None, TOY, dataset=free, **run)
     assert result.student.low.tolist() == [-1, -1]
     assert np.abs(result.student.act(100 * states.astype(np.float32))).max() <= 1
     other = fdtasil.from_arrays(states, actions, low=-9, high=9)
-    with pytest.warns(
-        FdtasilWarning, match=r"bounds are \[-9.0, -9.0\] to \[9.0, 9.0\], those of"
-    ):
+    with pytest.warns(FdtasilWarning, match="a dataset with the action bounds -9 to 9: the stud"):
         result = fdtasil.distill(linear, TOY, dataset=other, **run)
     assert result.student.high.tolist() == [9, 9]
+    with pytest.warns(FdtasilWarning, match="actions lie beyond low and high"):
+        wrong = fdtasil.from_arrays(states, actions, low=5)
+    with pytest.raises(SettingError, match="the action bounds 5 to inf"):
+        fdtasil.distill(linear, TOY, dataset=wrong, **run)
 
 
 def test_an_array_for_each_episode(arrays):
@@ -455,9 +473,19 @@ def test_an_array_for_each_episode(arrays):
     found = fdtasil.from_arrays(*parts)
     whole = fdtasil.from_arrays(states, actions, episode_ends=[15, 40])
     assert found.to_bytes() == whole.to_bytes()
-    with pytest.raises(SettingError, match="of other lengths"):
-        fdtasil.from_arrays(parts[0], [actions[:10], actions[10:]])
-    with pytest.raises(SettingError, match="beside episode_ends"):
+    for wrong in (
+        [actions[:10], actions[10:]],
+        [actions[:15], actions[15:, :1]],
+        [actions[:15], actions[15:, 0]],
+        [actions[:15]],
+        actions[:, 0],
+        None,
+    ):
+        with pytest.raises(SettingError, match="episodes of observations of shapes"):
+            fdtasil.from_arrays(parts[0], wrong)
+    with pytest.raises(SettingError, match="episodes of observations of shapes"):
+        fdtasil.from_arrays([*parts[0], states[:0]], [*parts[1], actions[:0]])
+    with pytest.raises(SettingError, match="episode_ends= beside 2 episodes"):
         fdtasil.from_arrays(*parts, episode_ends=[15, 40])
 
 

@@ -488,7 +488,9 @@ def test_a_law_of_steps_is_said_to_be_one():
     assert "the expert answers in steps" in str(found)
     smooth = fdtasil.diagnose(lqr, lqr, "InvertedPendulum-v5", episodes=2, horizon=30)
     assert smooth.regime == "smooth"
-    assert "in steps" not in str(smooth)
+    constant = fdtasil.diagnose(rest, rest, "InvertedPendulum-v5", episodes=2, horizon=30)
+    assert constant.regime is None
+    assert "in steps" not in str(smooth) + str(constant)
 
 
 @pytest.mark.fault(280)

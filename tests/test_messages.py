@@ -7,6 +7,7 @@ from conftest import GAIN, QUICK, TOY
 
 import fdtasil
 from fdtasil.errors import EnvironmentFault, FdtasilError
+from fdtasil.probes.answers import ask_moved
 
 pytestmark = pytest.mark.usefixtures("no_pictures")
 
@@ -15,6 +16,10 @@ STATES = np.zeros((4, 5), np.float32)
 
 def asked(answer):
     return lambda: fdtasil.load_expert(lambda rows: answer, 5, 2).ask(STATES, "act")
+
+
+def sums(rows):
+    return rows.sum(axis=1)
 
 
 def one_state(row):
@@ -26,7 +31,9 @@ def one_state(row):
     [
         (asked(None), "a row of NaN"),
         (asked([None]), "a row of NaN"),
-        (asked(np.zeros(4)), r"found\[:, None\]"),
+        (asked(np.zeros(4)), "one row of actions for each row"),
+        (asked([]), "one row of actions for each row"),
+        (lambda: fdtasil.load_expert(sums, 5, 1).ask(STATES, "act"), r"found\[:, None\]"),
         (lambda: fdtasil.load_expert(one_state, 5, 2).ask(STATES, "act"), "for row in rows"),
         (lambda: fdtasil.load_expert("mpc.py"), r"fdtasil.distill\(function"),
         (lambda: fdtasil.load_expert("mpc:plan"), r"fdtasil.distill\(function"),
@@ -34,9 +41,9 @@ def one_state(row):
         (lambda: fdtasil.load_expert("ws://localhost:8000/act"), "begins with http://"),
         (lambda: fdtasil.distill(len, TOY, "4,central,forward"), "'central' beside 'forward'"),
         (lambda: fdtasil.distill(len, TOY, "4,labels,both"), "'labels' beside 'both'"),
-        (lambda: fdtasil.distill(len, TOY, "4,radius=abc"), "write radius=0.3"),
+        (lambda: fdtasil.distill(len, TOY, "4,radius=abc"), "radius=0.3, radius=0.2"),
         (lambda: fdtasil.distill(len, TOY, student="small"), r"fdtasil.Mlp\(\(64, 64\)\)"),
-        (lambda: fdtasil.distill(len, TOY, resume="nowhere"), "nothing was"),
+        (lambda: fdtasil.distill(len, TOY, resume="nowhere"), "start it again"),
     ],
 )
 def test_the_way_out_is_named(call, said, tmp_path, monkeypatch):
@@ -63,20 +70,23 @@ def test_an_environment_without_a_space(missing):
     assert f"self.{missing} = gymnasium.spaces.Box" in caught.value.next_step
 
 
-def test_a_server_that_is_gone_is_no_matter_of_the_radius():
-    class Gone:
-        def __init__(self):
-            self.asked = 0
+@pytest.mark.parametrize(
+    ("problem", "advised"), [(ConnectionRefusedError, False), (MemoryError, True)]
+)
+def test_a_connection_that_broke_is_no_matter_of_the_radius(problem, advised):
+    def gone(rows):
+        raise problem("gone")
 
-        def __call__(self, rows):
-            self.asked += 1
-            if len(rows) > 100 and self.asked > 60:
-                raise ConnectionRefusedError("refused")
-            return rows @ GAIN.T
+    with pytest.raises(FdtasilError, match="states moved by probes") as caught:
+        ask_moved(fdtasil.load_expert(gone, 5, 2), STATES, "probe")
+    assert ("radius" in caught.value.next_step) == advised
 
-    with pytest.raises(FdtasilError, match="ConnectionRefusedError") as caught:
-        fdtasil.distill(Gone(), TOY, 10, **QUICK)
-    assert "radius" not in caught.value.next_step
+
+@pytest.mark.parametrize("path", ["C:/models/e.onnx", "runs/2024-01-01T12:00:00/student.onnx"])
+def test_a_path_with_a_colon_is_no_address(path):
+    with pytest.raises(FdtasilError, match="No such file") as caught:
+        fdtasil.load_expert(path)
+    assert "http://" not in caught.value.next_step
 
 
 @pytest.mark.parametrize("call", [lambda r: r.save(None), lambda r: r.export(None)])
@@ -90,3 +100,4 @@ def test_a_dictionary_in_the_place_of_the_numbers_of_a_history(quick):
     result = fdtasil.distill(lambda rows: rows @ GAIN.T, TOY, 0, **run)
     with pytest.raises(FdtasilError, match="an observation that is a dict"):
         fdtasil.History(result.student, 2).predict({"speed": np.zeros(5)})
+    fdtasil.History(result.student, 2).predict((0.1, 0.2, 0.3, 0.4, 0.5))

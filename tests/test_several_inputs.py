@@ -2,6 +2,7 @@
 
 import numpy as np
 import onnx
+import onnxruntime
 import pytest
 from conftest import QUICK, TOY
 from onnx import TensorProto, helper, numpy_helper
@@ -9,6 +10,7 @@ from onnx import TensorProto, helper, numpy_helper
 import fdtasil
 from fdtasil.errors import ExpertError, SettingError
 from fdtasil.experts.load import load_expert
+from fdtasil.files.onnx.binding import Choices, bind
 from fdtasil.shell.call import opened
 
 pytestmark = pytest.mark.usefixtures("no_pictures")
@@ -178,3 +180,23 @@ def test_wrong_inputs_are_named(noisy, inputs, found):
     with pytest.raises(SettingError, match=found) as error:
         load_expert(noisy, 5, 2, inputs=inputs)
     assert len(str(error.value).splitlines()) <= 6
+
+
+@pytest.mark.parametrize("width", ["", ", 1"])
+def test_an_input_of_a_choice_is_given_its_number_in_its_own_shape(width):
+    model = onnx.parser.parse_model(
+        f"""<ir_version: 8, opset_import: ["" : 17]>
+        law (float[N, 2] speed, int64[N{width}] gear) => (float[N, 1] y) {{
+            shape = Constant <value = int64[2] {{-1, 1}}> ()
+            column = Reshape (gear, shape)
+            number = Cast <to = 1> (column)
+            axes = Constant <value = int64[1] {{1}}> ()
+            total = ReduceSum <keepdims = 1> (speed, axes)
+            y = Add (total, number)
+        }}"""
+    )
+    given = {"speed": slice(0, 2), "gear": Choices(((2, 5),), (7,))}
+    session = onnxruntime.InferenceSession(bind(model, given, 5).SerializeToString())
+    rows = np.float32([[0.5, 0.25, 0, 1, 0], [1, 1, 0, 0, 1]])
+    (answers,) = session.run(None, {session.get_inputs()[0].name: rows})
+    assert answers[:, 0].tolist() == [8.75, 11.0]

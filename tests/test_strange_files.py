@@ -349,7 +349,7 @@ def test_own_checkpoints_beside_a_finished_run_stay(run, quick, never):
 def test_an_unfinished_run_is_not_deleted_either(linear, tmp_path):
     with pytest.raises(Stop):
         fdtasil.distill(linear, TOY, 2, out=tmp_path / "run", callback=stop, **QUICK)
-    with pytest.raises(SettingError, match="unfinished") as caught:
+    with pytest.raises(SettingError, match="a run that has not ended") as caught:
         fdtasil.distill(linear, TOY, 2, out=tmp_path / "run", **QUICK)
     assert "remove" not in str(caught.value)
 

@@ -12,7 +12,7 @@ import numpy as np
 
 from fdtasil.checks import check_path
 from fdtasil.demonstrations.states import Demonstrations
-from fdtasil.errors import SettingError, StorageError, shown
+from fdtasil.errors import SettingError, StorageError, shown, warn
 from fdtasil.files.arrays import arrays_from_bytes
 from fdtasil.files.border import reads
 from fdtasil.files.plain import as_kind
@@ -189,6 +189,23 @@ def check_dataset(dataset: Dataset) -> Dataset:
                 "drop these rows, and find out what made them",
             )
     return dataset
+
+
+def warn_of_bounds(dataset: Dataset) -> None:
+    """Warn of recorded actions that no student reaches."""
+    actions = dataset.demonstrations.actions
+    ends = [np.where(np.isfinite(end), np.abs(end), 0.0) for end in (dataset.low, dataset.high)]
+    beyond = np.maximum(actions - dataset.high, dataset.low - actions)
+    outside = int((beyond > _ROUNDED * np.maximum(*ends)).any(axis=1).sum())
+    if outside:
+        warn(
+            f"{outside:,} of {len(actions):,} actions lie beyond low and high, by up to "
+            f"{beyond.max():.2g}: a student stays within them; check that they are the bounds of "
+            "the environment that the actions are for"
+        )
+
+
+_ROUNDED = 1e-5  # of an action's larger bound: what float32 and files round
 
 
 def check_shapes(dataset: Dataset) -> dict[str, np.ndarray]:

@@ -1,18 +1,17 @@
 """Demonstrations from arrays that somebody has, with neither rewards nor an expert."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 
-from fdtasil.demonstrations.dataset import Dataset, check_dataset
+from fdtasil.demonstrations.dataset import Dataset, check_dataset, warn_of_bounds
 from fdtasil.demonstrations.states import Demonstrations
-from fdtasil.errors import SettingError, warn
+from fdtasil.errors import SettingError, shown, warn
 from fdtasil.rollouts.flattening import unbounded
 from fdtasil.rollouts.spaces import to_numpy
 
 __all__ = ["from_arrays"]
-
-_ROUNDED = 1e-5  # of the largest bound: what float32 and files round
 
 
 def from_arrays(
@@ -71,38 +70,33 @@ def from_arrays(
         np.zeros(count, bool),
     )
     found = check_dataset(Dataset(states, None, None, least, most, environment))
-    _warn_of_bounds(found)
+    warn_of_bounds(found)
     return found
 
 
 def _joined(
-    observations: Any, actions: Any, ends: Any
+    observations: Sequence[Any], actions: Any, ends: Any
 ) -> tuple[np.ndarray, np.ndarray, list[int]]:
     """Return the arrays of some episodes as one each, and where the episodes end."""
-    parts = [[to_numpy(part) for part in parts] for parts in (observations, actions)]
-    lengths = [[len(part) for part in side] for side in parts]
-    if ends is not None or lengths[0] != lengths[1]:
+    if ends is not None:
         raise SettingError(
-            f"{len(parts[0])} episodes of observations and {len(parts[1])} of actions, "
-            + ("beside episode_ends" if ends is not None else "of other lengths"),
-            "an array of each for every episode, of equal lengths",
-            "leave episode_ends= out, or join the arrays with np.concatenate",
+            f"episode_ends= beside {len(observations)} episodes",
+            "one of the two: a list of episodes says where they end",
+            "leave episode_ends= out",
         )
-    return np.concatenate(parts[0]), np.concatenate(parts[1]), np.cumsum(lengths[0]).tolist()
-
-
-def _warn_of_bounds(dataset: Dataset) -> None:
-    """Warn of recorded actions that no student reaches."""
-    actions = dataset.demonstrations.actions
-    beyond = np.maximum(actions - dataset.high, dataset.low - actions).max(axis=1)
-    reach = np.where(np.isfinite(dataset.high), np.abs(dataset.high), 1.0).max()
-    outside = int((beyond > _ROUNDED * reach).sum())
-    if outside:
-        warn(
-            f"{outside:,} of {len(actions):,} actions lie beyond low and high, by up to "
-            f"{beyond.max():.2g}: a student stays within them; check that they are the bounds of "
-            "the environment that the actions are for"
+    parts = [to_numpy(part) for part in observations]
+    labels = [to_numpy(part) for part in actions] if isinstance(actions, list | tuple) else []
+    shapes, theirs = [part.shape for part in parts], [part.shape for part in labels]
+    good = [len(shape) == 2 and shape[0] > 0 for shape in shapes + theirs]
+    widths = [{shape[-1] for shape in of if shape} for of in (shapes, theirs)]
+    lengths = [shape[0] for shape in shapes if shape]
+    if not all(good) or lengths != [s[0] for s in theirs if s] or max(map(len, widths)) > 1:
+        raise SettingError(
+            f"episodes of observations of shapes {shown(shapes)}, of actions {shown(theirs)}",
+            "lists of as many arrays, (T, n) and (T, m), T at least 1 and the same in both",
+            "look at the first episode whose arrays are of other lengths or widths",
         )
+    return np.concatenate(parts), np.concatenate(labels), np.cumsum(lengths).tolist()
 
 
 def _numbers(name: str, given: Any) -> np.ndarray:

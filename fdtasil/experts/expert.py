@@ -278,7 +278,7 @@ class Expert:
             raise ExpertError(
                 f"{self.name} answered {rows.shape} observations with shape {answer.shape}",
                 expected,
-                _advice(answer),
+                _advice(answer, len(rows), self.action_size),
             )
         infinite = np.asarray(np.isinf(answer).any(axis=1))
         if infinite.any():
@@ -290,10 +290,7 @@ class Expert:
         """What it is called with, for who called it wrongly."""
         layout = self.spaces.observations if self.spaces and self.own_form else None
         if layout is None or layout.plain:
-            return (
-                "experts answer (B, n) with (B, m), one of a single state by "
-                "lambda rows: np.array([f(row) for row in rows])"
-            )
+            return "experts answer (B, n) with (B, m)"
         parts = [
             f"{p.name or 'an array'} (B, {', '.join(map(str, p.shape))})" for p in layout.parts
         ]
@@ -303,14 +300,12 @@ class Expert:
         return self.action_size is None or answer.shape[1] == self.action_size
 
 
-def _advice(answer: np.ndarray) -> str:
+def _advice(answer: np.ndarray, rows: int, action_size: int | None) -> str:
     """Return what to do about answers of another shape."""
-    if answer.ndim < 2 and np.isnan(answer).all():
+    if answer.ndim < 2 and answer.size and np.isnan(answer).all():
         return "in the place of None, return a row of NaN for each row that has no answer"
-    if answer.ndim == 1:
-        return (
-            "return one row of actions for each row of observations: found[:, None] of one action"
-        )
+    if answer.shape == (rows,) and action_size in (None, 1):
+        return "of one action, return found[:, None]: a row for each row of observations"
     return "return one row of actions for each row of observations"
 
 
@@ -335,7 +330,8 @@ class _Raised(Exception):
         whole = ExpertError(
             f"{name} raised {kind} on {rows} observations: {said}",
             expected,
-            f"call it on such a batch on its own; {given}",
+            f"call it on such a batch on its own; {given}"
+            + (_EACH if kind in _OF_SHAPES and rows > 1 else ""),
         )
         whole.__cause__ = error
         return cls(whole, f"{kind}: {said}", everywhere=kind in _NOT_OF_A_ROW)
@@ -343,6 +339,8 @@ class _Raised(Exception):
 
 _DOUBTED = (8, 64, 512)
 """Rows in a row without an answer, after which it is asked what it has answered before."""
+_OF_SHAPES = {"ValueError", "TypeError", "IndexError"}
+_EACH = ", one of a single state by lambda rows: np.array([f(row) for row in rows])"
 _NOT_OF_A_ROW = {"MemoryError", "TimeoutError", "RecursionError"}
 
 

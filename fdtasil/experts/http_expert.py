@@ -105,7 +105,7 @@ class _Client:
     def __call__(self, rows: np.ndarray) -> np.ndarray:
         body = json.dumps({"observations": rows.tolist()}, allow_nan=False).encode()
         limit = _TEXT_BYTES + _NUMBER_BYTES * len(rows) * (self._action_size or _MOST_ACTIONS)
-        problem = ""
+        problem, broken = "", None
         for pause in (0.0, *_PAUSES):
             time.sleep(pause)
             try:
@@ -113,18 +113,18 @@ class _Client:
             except ExpertError:
                 raise
             except (ConnectionError, http.client.IncompleteRead) as error:
-                problem = f"{type(error).__name__}: {first_line(error)}"
+                problem, broken = f"{type(error).__name__}: {first_line(error)}", error
                 continue
             except (OSError, http.client.HTTPException) as error:
                 raise self._unreachable(error) from error
             if response.status not in _BUSY:
                 return self._actions(response, data)
-            problem = _status(response)
+            problem, broken = _status(response), None
         raise ExpertError(
             f"{self.name} does not answer, {len(_PAUSES) + 1} tries: {problem}",
             f"a server that answers {_REQUEST}",
             "start it, or see why it stopped, and check host and port",
-        )
+        ) from broken
 
     def _post(self, body: bytes, limit: int) -> tuple[http.client.HTTPResponse, bytes]:
         connection = self._connection()

@@ -197,7 +197,7 @@ def _chosen(entries: "Sequence[onnx.ValueInfoProto]", observations: Layout) -> d
         dimensions = named[part.name].type.tensor_type.shape.dim[1:]
         if math.prod(dimension.dim_value for dimension in dimensions) == len(part.sizes):
             ends = np.cumsum([start, *part.sizes]).tolist()
-            found[part.name] = Choices(tuple(pairwise(ends)), part.first, part.shape)
+            found[part.name] = Choices(tuple(pairwise(ends)), part.first)
     return found
 
 

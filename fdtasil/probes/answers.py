@@ -199,7 +199,8 @@ def ask_moved(expert: Expert, points: np.ndarray, purpose: Purpose) -> np.ndarra
             "the radius be smaller"
         )
         # A connection that broke says nothing of states.
-        step = error.next_step + ("" if isinstance(error.__cause__, OSError) else beyond)
+        broken = isinstance(error.__cause__, OSError)
+        step = error.next_step + ("" if broken else beyond)
         found = f"{error.found} (states moved by probes)"
         raise ExpertError(found, error.expected, step) from error
 

@@ -60,7 +60,8 @@ def _of_module(module: torch.nn.Module, order: int) -> Along:
 
     def along(states: np.ndarray, directions: np.ndarray) -> np.ndarray:
         where = [
-            torch.from_numpy(part).to(like.device, like.dtype) for part in (states, directions)
+            torch.from_numpy(np.ascontiguousarray(part)).to(like.device, like.dtype)
+            for part in (states, directions)
         ]
         with torch.no_grad():
             return every(*where).float().cpu().numpy()

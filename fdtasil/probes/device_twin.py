@@ -55,7 +55,7 @@ class DeviceTwin:
             module = copy.deepcopy(expert.module).to(device).eval()
         except Exception:  # locks and the like; each type has its own
             return None
-        observations = torch.from_numpy(around.observations).to(device)
+        observations = torch.from_numpy(np.ascontiguousarray(around.observations)).to(device)
         twin = cls(expert, module, observations, stencil.offsets)
         error = twin._error(said)
         if error > AGREEMENT:

@@ -57,7 +57,7 @@ class Gains:
         sizes = np.sqrt(np.nanmean((self.jacobian * self.scale) ** 2, axis=0))
         rows = [
             ("states", f"{len(self.jacobian)}, Jacobians of {sizes.shape[0]} x {sizes.shape[1]}"),
-            ("radius", f"{self.radius:.2g} standard deviations of each coordinate"),
+            ("radius", f"{self.radius:.2g} of each coordinate's scale"),
             ("error", f"{self.relative_error:.1%} of the Jacobian's norm, estimated"),
             ("noise", f"{float(self.noise_floor.max()):.1e} in an action, at most"),
             ("queries", f"{self.queries:,}"),
@@ -67,7 +67,7 @@ class Gains:
             rows.append(("note", told))
         strongest = np.argsort(sizes, axis=None)[::-1][:5]
         for action, coordinate in zip(*np.unravel_index(strongest, sizes.shape), strict=True):
-            about = f"{sizes[action, coordinate]:.3g} for each standard deviation"
+            about = f"{sizes[action, coordinate]:.3g} for its scale"
             rows.append((f"action {action}", f"coordinate {coordinate}: {about}"))
         return "\n".join(f"{name:10} {text}" for name, text in rows)
 

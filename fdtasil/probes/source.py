@@ -287,7 +287,10 @@ _NUMBERS: dict[str, Callable[[str], object]] = {
 }
 
 
-_NUMBERS_LIKE = {"radius": "radius=0.3, radius=0.2..2 or radius=wide", "per_step": "per_step=2"}
+_LIKE = {
+    "radius": "radius=0.3, radius=0.2..2 or radius=wide",
+    "per_step": "per_step=2 or per_step=all",
+}
 
 
 def _describe(directions: Directions) -> str:
@@ -336,5 +339,5 @@ def _parse_option(option: str, spec: str) -> dict[str, object]:
     try:
         return {key: _NUMBERS[key](value)}
     except ValueError:
-        found, example = f"probes={spec!r}: {value!r} in {option!r}", _NUMBERS_LIKE[key]
-        raise SettingError(found, f"{key}= with a number", f"write {example}") from None
+        found = f"probes={spec!r}: {value!r} in {option!r}"
+        raise SettingError(found, _LIKE[key], "write one of these") from None

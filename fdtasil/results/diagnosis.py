@@ -42,12 +42,12 @@ class Diagnosis:
         linearisation: Eigenvalues of both closed loops along the expert's path; None where the
             environment is no MuJoCo environment of gymnasium, or its actions are no controls.
         errors: Of the student's action and derivative at states of the expert's first steps, as
-            the theorems ask for; None where no law was found, the expert has no answer around
-            them, or not one coordinate moves, or more than 1,000.
+            the theorems ask for; None where no law was found, the expert answers in steps or has
+            no answer around them, or not one coordinate moves, or more than 1,000.
         conditions: TaSIL's statements that are about such a loop, with these constants; none where
             no law was found, or the expert answers in steps.
         regime: How the expert answers: "smooth", "noisy" or "steps", as in `Calibration`; None
-            where it has no answers around its states.
+            where it has no answers around its states, or always the same.
     """
 
     fidelity: Fidelity

@@ -24,7 +24,8 @@ class Evaluation:
         normalized_return: (student - reference) / (expert - reference); 1 is the expert. None
             where the expert is no better than the reference, and the share means nothing.
         ci95: 95 % bootstrap interval of the normalised return, over paired episodes; None with it,
-            or for a single pair. Of fewer than ten pairs it is too narrow.
+            for a single pair, or where the expert's returns are not surely above the reference.
+            Of fewer than ten pairs it is too narrow.
         survival: Share of the student's episodes that neither the environment ended, nor a policy
             that had no answer for too long.
         expert_survival: The same for the expert.

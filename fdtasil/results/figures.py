@@ -122,7 +122,7 @@ def draw_calibration(found: Calibration) -> bytes:
     change.axhline(found.noise_floor, color=_EXPERT, linestyle=":", label="noise floor")
     if max(*found.change, found.noise_floor) > 0:  # an expert that answers everywhere the same
         change.set_yscale("log")
-    change.set_title("change of the action", fontsize=9)
+    change.set_title("change of an action in its unit", fontsize=9)
     change.set_ylabel("root mean square")
     agreement.plot(found.radii[1:], found.similarity[1:], color=_STUDENT, marker="o", markersize=3)
     agreement.set_ylim(-0.05, 1.05)

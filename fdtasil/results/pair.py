@@ -19,6 +19,7 @@ from fdtasil.seeding import generator
 __all__ = ["evaluate_pair"]
 
 _RESAMPLES = 2000
+_OUTSIDE = 0.05  # share of the draws beyond the ends of an interval
 
 
 def evaluate_pair(
@@ -146,28 +147,23 @@ def _share(ours: np.ndarray, theirs: np.ndarray) -> float:
 
 
 def _interval(ours: np.ndarray, theirs: np.ndarray, seed: int) -> tuple[float, float] | None:
-    """Bootstrap the pairs' share of the expert's mean return, which is held.
+    """Bootstrap the ratio of the means over pairs.
 
-    A ratio of two drawn means covers no better, and where the expert's returns lie near the
-    reference some draws have no expert left to be a share of.
+    A draw whose expert is not above the reference may stand for any ratio: it counts below the
+    lower end and above the upper one. Where there are many of them, there is no interval.
     """
     if len(ours) < 2:
         return None
-    share = _share(ours, theirs)
-    beyond = (ours - share * theirs) / theirs.mean()  # what each pair says beyond the share
-    if not beyond.any():
-        return share, share
-    from scipy import stats  # loads for most of a second, and many runs end before it
-
-    found = stats.bootstrap(
-        (beyond,),
-        np.mean,
-        method="percentile",
-        n_resamples=_RESAMPLES,
-        rng=generator(seed, "bootstrap"),
-    )
-    low, high = found.confidence_interval
-    return share + float(low), share + float(high)
+    largest = np.abs(theirs).argmax()  # a pair of zeros has every ratio
+    if np.array_equal(ours * theirs[largest], theirs * ours[largest]):
+        point = _share(ours, theirs)
+        return point, point
+    draws = generator(seed, "bootstrap").integers(len(ours), size=(_RESAMPLES, len(ours)))
+    above, mine = theirs[draws].mean(axis=1), ours[draws].mean(axis=1)
+    ratios = np.divide(mine, above, out=np.full(_RESAMPLES, np.inf), where=above > 0)
+    low = np.quantile(np.where(above > 0, ratios, -np.inf), _OUTSIDE / 2, method="lower")
+    high = np.quantile(ratios, 1 - _OUTSIDE / 2, method="higher")
+    return (float(low), float(high)) if np.isfinite([low, high]).all() else None
 
 
 def _imitation_gap(student: Episodes, expert: Episodes) -> float:

@@ -47,9 +47,9 @@ def smoothness_of(episodes: Episodes, pool: EnvironmentPool, expert: Episodes) -
     if chosen.choices:
         best = chosen.best(acted.reshape(-1, m)).reshape(*episodes.valid.shape, -1)
         return Smoothness(float((best[:, 1:] != best[:, :-1])[both].mean()), None)
-    actions = measure_actions(expert.actions[expert.valid])
-    units = action_units(pool.boxes.low, pool.boxes.high, actions)
-    scaled = acted / np.where(units > 0, units, 1.0)
+    taken, _ = pool.bounds.put_inside(expert.actions[expert.valid])
+    units = action_units(pool.boxes.low, pool.boxes.high, measure_actions(taken))
+    scaled = acted / units
     rough = float(np.abs(np.diff(scaled, axis=1))[both].mean())
     return Smoothness(rough, _high_frequency(scaled, episodes.lengths))
 

@@ -38,8 +38,9 @@ def examine_given(expert: Expert, given: Dataset, *, admit: bool, force: bool) -
     heard = ~has_none(answers)
     clipped = np.clip(answers[heard], given.low, given.high)
     apart = np.abs(clipped - np.clip(said[heard], given.low, given.high))
-    spread = measure_scales(states.actions).units
-    far = apart > _SAME * np.maximum(spread, _STILL * spread.max())
+    scales = measure_scales(states.actions)
+    least = _STILL * scales.deviation[scales.live].max()
+    far = apart > _SAME * np.maximum(np.where(scales.live, scales.deviation, 0.0), least)
     other = int(far.any(axis=1).sum())
     if other:
         warn(

@@ -199,8 +199,8 @@ def _read_config(path: Path) -> dict[str, Any]:
         raise SettingError(
             f"{path} holds no run to resume ({type(error).__name__})",
             f"a folder with a {CONFIG}",
-            "check the path, or start the run with out= (--out), as one does of which nothing was "
-            "kept when it ended",
+            "check the path; where the run ended before anything was kept, start it again with "
+            "out= (--out)",
         ) from error
 
 

@@ -8,8 +8,8 @@ from itertools import chain
 import numpy as np
 
 from fdtasil.checks import spelt
-from fdtasil.demonstrations.dataset import Dataset
-from fdtasil.errors import SettingError, warn
+from fdtasil.demonstrations.dataset import Dataset, warn_of_bounds
+from fdtasil.errors import SettingError, shown, warn
 from fdtasil.experts.carrying import carry
 from fdtasil.experts.expert import Expert
 from fdtasil.experts.load import ExpertLike, expert_in, load_expert
@@ -115,18 +115,38 @@ def open_subject(
 
 
 def bounded(given: Dataset, pool: EnvironmentPool) -> Dataset:
-    """Return a dataset with the environment's bounds of those actions that it has none of."""
+    """Return a dataset with the environment's bounds of those actions that it has none of.
+
+    Raises:
+        SettingError: If no action lies within both.
+    """
+    boxes = pool.boxes
     low, high = (
         np.where(np.isfinite(said), said, own).astype(np.float32)
-        for said, own in ((given.low, pool.boxes.low), (given.high, pool.boxes.high))
+        for said, own in ((given.low, boxes.low), (given.high, boxes.high))
     )
-    if not (np.allclose(low, pool.boxes.low) and np.allclose(high, pool.boxes.high)):
-        warn(
-            f"the dataset's action bounds are {low.tolist()} to {high.tolist()}, those of "
-            f"{pool.name} {pool.boxes.low.tolist()} to {pool.boxes.high.tolist()}: the student "
-            "stays within the dataset's"
-        )
-    return replace(given, low=low, high=high)
+    theirs = f"{pool.name} has the action bounds {_shown(boxes.low)} to {_shown(boxes.high)}"
+    found = f"a dataset with the action bounds {_shown(given.low)} to {_shown(given.high)}"
+    if not (low < high).all():
+        raise SettingError(found, theirs, "leave low= and high= out of from_arrays")
+    if not (np.allclose(low, boxes.low) and np.allclose(high, boxes.high)):
+        warn(f"{found}: the student stays within them; {theirs}")
+    whole = replace(given, low=low, high=high)
+    if not (np.array_equal(low, given.low) and np.array_equal(high, given.high)):
+        warn_of_bounds(whole)
+    return whole
+
+
+def _shown(bounds: np.ndarray) -> str:
+    """Return one number where all are equal, else the first of them."""
+    if (bounds == bounds[0]).all():
+        return f"{bounds[0]:g}"
+    return shown(
+        ", ".join(f"{bound:g}" for bound in bounds[:_FEW]) + ", ..." * (len(bounds) > _FEW)
+    )
+
+
+_FEW = 6
 
 
 def history_with(history: int, given: Dataset | None) -> int:

@@ -77,7 +77,7 @@ def command(
 
 
 def _without(found: Gains, held: list[int]) -> Gains:
-    """Leave out coordinates that are choices: nothing is between two of them."""
+    """Leave out choices, flags and whole numbers: nothing is between two of them."""
     jacobian, error = found.jacobian.copy(), found.error.copy()
     jacobian[..., held] = error[..., held] = 0.0
     return replace(found, jacobian=jacobian, error=error)

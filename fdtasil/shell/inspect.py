@@ -75,7 +75,7 @@ def command(
     if found is not None:
         rows += [
             ("regime", found.regime),
-            ("noise floor", f"{found.noise_floor:.1e} of an action, root mean square"),
+            ("noise floor", f"{found.noise_floor:.1e} of an action's unit, root mean square"),
             ("suggested radius", f"{found.radius:.2g} deviations, {found.stencil} stencil"),
             ("what is matched", found.match or "differences"),
         ]

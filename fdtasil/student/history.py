@@ -1,7 +1,5 @@
 """A student that sees the last observations and actions, with a buffer of its own."""
 
-from collections.abc import Mapping
-
 import numpy as np
 
 from fdtasil.checks import check_count
@@ -70,13 +68,15 @@ class History:
         """
         if episode_start:
             self._window.clear()
-        if isinstance(observation, Mapping | tuple):
+        n = self.observation_size
+        try:
+            seen = np.asarray(observation, np.float32)
+        except (TypeError, ValueError) as error:
             raise SettingError(
                 f"an observation that is a {type(observation).__name__}",
-                f"({self.observation_size},), its flat form",
+                f"({n},), its flat form",
                 "pass result.dataset.spaces.observations.row(observation)",
-            )
-        seen, n = np.asarray(observation, np.float32), self.observation_size
+            ) from error
         if seen.shape != (n,):
             raise SettingError(
                 f"an observation of shape {seen.shape}",

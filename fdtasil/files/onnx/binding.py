@@ -27,12 +27,10 @@ class Choices:
     Attributes:
         ends: First column of each choice, and the one after its last, side by side.
         first: Number of the first possibility of each.
-        shape: Of the numbers of an observation.
     """
 
     ends: tuple[tuple[int, int], ...]
     first: tuple[int, ...]
-    shape: tuple[int, ...]
 
     @property
     def start(self) -> int:
@@ -136,7 +134,7 @@ def bind(
         if isinstance(part, np.ndarray):
             value = _repeat(nodes, part, shape[1])
         elif isinstance(part, Choices):
-            value = _numbers(nodes, part)
+            value = _numbers(nodes, part, shape[1:])
         else:
             value = _take(nodes, part, shape)
         nodes.node("Cast", value, to=kind.elem_type)
@@ -222,15 +220,13 @@ def _take(nodes: Nodes, columns: slice, shape: Sequence[int]) -> str:
     return flat
 
 
-def _numbers(nodes: Nodes, choices: Choices) -> str:
-    """Add the numbers of choices, in the shape that a part of the observation has."""
+def _numbers(nodes: Nodes, choices: Choices, shape: Sequence[int]) -> str:
+    """Add the numbers of choices, in the shape that an input has."""
     best = []
     for (start, stop), first in zip(choices.ends, choices.first, strict=True):
         chosen = nodes.node("ArgMax", _sliced(nodes, start, stop), axis=1, keepdims=1)
         best.append(nodes.node("Add", chosen, nodes.integers([first])))
-    return nodes.node(
-        "Reshape", nodes.node("Concat", *best, axis=1), nodes.integers([-1, *choices.shape])
-    )
+    return nodes.node("Reshape", nodes.node("Concat", *best, axis=1), nodes.integers([-1, *shape]))
 
 
 def _repeat(nodes: Nodes, value: np.ndarray, width: int) -> str:

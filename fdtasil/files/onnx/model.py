@@ -1,6 +1,7 @@
 """Reading an ONNX file with its weights: nothing outside its folder, no code of it is run."""
 
 import io
+import re
 import zipfile
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -118,12 +119,14 @@ def _read_bytes(path: Path) -> bytes:
             "name the file itself",
         )
     beside = [p.name for p in (path.with_name(f"{path.name}{end}") for end in _ENDS) if p.exists()]
-    hint = f"name it whole: {beside[0]}" if beside else _MISSING
-    if ":" in str(path) and not path.exists():
-        hint = _ADDRESS
+    hint = _ADDRESS if _NO_FILE.match(str(path)) else _MISSING
+    if beside:
+        hint = f"name it whole: {beside[0]}"
     return read_limited(path, _SIZE_LIMIT, "an ONNX file", hint)
 
 
+# host:8000/act, ws:/host or module:function; a drive has one letter.
+_NO_FILE = re.compile(r"[\w.-]{2,}:(/|\d+(/|$)|[A-Za-z_]\w*$)")
 _MISSING = "check the path; `fdtasil experts` lists the shipped ones, and fetches them"
 _ADDRESS = (
     "an address begins with http://, https:// or hf://; a function is passed in Python: "
