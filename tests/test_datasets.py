@@ -303,7 +303,8 @@ def test_arrays_of_anybody_are_learnt_from(change, linear):
 
 @pytest.mark.fault(278)
 def test_reversed_arrays_are_differentiated_too():
-    law = torch.nn.Sequential(torch.nn.Linear(5, 2), torch.nn.Tanh())
+    with torch.random.fork_rng():
+        law = torch.nn.Sequential(torch.nn.Linear(5, 2), torch.nn.Tanh())
     given = fdtasil.distill(law, TOY, 0, **QUICK).dataset
     states = given.demonstrations
     turned = {name: array[::-1] for name, array in vars(states).items()}
