@@ -95,6 +95,21 @@ def test_a_factory_that_hands_out_one_environment_is_used_one_episode_at_a_time(
     assert np.allclose(found, expected, atol=1e-5)
 
 
+@pytest.mark.fault(274)
+@pytest.mark.parametrize("unit", [1.0, 1e5])
+def test_an_action_in_large_numbers_does_not_hide_the_noise_of_another(unit):
+    boxes = Boxes(5, np.full(2, -np.inf, np.float32), np.full(2, np.inf, np.float32))
+    rows = np.random.default_rng(0).standard_normal((16, 5)).astype(np.float32)
+    random = np.random.default_rng(1)
+
+    def noisy(given):
+        noise = 0.05 * random.standard_normal(len(given))
+        return np.stack([unit * given[:, 0], given[:, 1] + noise], axis=1)
+
+    with pytest.raises(ExpertError, match="asked twice differs"):
+        admit_expert(load_expert(noisy), rows, boxes)
+
+
 @pytest.mark.fault(281)
 def test_chance_that_few_rows_did_not_show_is_not_taken_for_the_size_of_a_batch():
     """With `batch=16` as advice, the check that found it would be gone."""

@@ -30,6 +30,7 @@ GATE_QUERIES = 3 * GATE_STATES
 # Differences between two answers, as a share of the action range. Batches of another size change
 # the last bits of a float32 product; quantised and stochastic experts change the third digit.
 _SAME = 1e-4
+_LEAST = 0.1  # of an action's size, what counts as the range of one without bounds at least
 
 
 @dataclass(frozen=True)
@@ -222,9 +223,9 @@ class _Answers:
     boxes: Boxes
 
     def same(self, other: np.ndarray, name: str, how: str, advice: tuple[str, str]) -> Finding:
-        difference = farthest_apart(self.answers, other)
+        difference, unit = farthest_apart(self.answers, other), self._ranges()
         measured = f"{how}: largest difference {difference:.1e}"
-        if difference <= _SAME * self._range():
+        if farthest_apart(self.answers / unit, other / unit) <= _SAME:
             return Finding(name, measured, None)
         found = f"{self.expert.name} {how} differs by up to {difference:.2g}"
         return Finding(name, measured, ExpertError(found, *advice))
@@ -262,13 +263,14 @@ class _Answers:
 
     def _apart(self, ours: np.ndarray, theirs: np.ndarray) -> tuple[int, float]:
         """Return at how many rows answers differ, and by how much at most."""
-        difference = np.nan_to_num(np.abs(ours - theirs).max(axis=1), nan=0.0)
-        return int((difference > _SAME * self._range()).sum()), float(difference.max())
+        difference = np.nan_to_num(np.abs(ours - theirs), nan=0.0)
+        wrong = (difference > _SAME * self._ranges()).any(axis=1)
+        return int(wrong.sum()), float(difference.max())
 
     def within_bounds(self) -> Finding:
         low, high = self.boxes.low, self.boxes.high
         beyond = np.maximum(self.answers - high, low - self.answers)
-        outside = float((beyond > _SAME * self._range()).any(axis=1).mean())
+        outside = float((beyond > _SAME * self._ranges()).any(axis=1).mean())
         measured = f"{100 * outside:.0f} % of the states have an action outside the bounds"
         if outside == 0:
             return Finding("action bounds", measured, None)
@@ -297,10 +299,12 @@ class _Answers:
             )
         return Finding("action scale", measured, None)
 
-    def _range(self) -> float:
-        width = self.boxes.high - self.boxes.low
-        bounded = width[np.isfinite(width)]
-        return float(bounded.min()) if bounded.size else max(1.0, float(np.ptp(self.answers)))
+    def _ranges(self) -> np.ndarray:
+        """Return the range of each action, (m,), so that one in millimetres is no measure."""
+        width = self.boxes.high.astype(np.float64) - self.boxes.low
+        sizes = np.abs(self.answers).max(axis=0)
+        seen = np.maximum(np.ptp(self.answers, axis=0), _LEAST * sizes)
+        return np.where(np.isfinite(width), width, np.where(seen > 0, seen, 1.0))
 
 
 def _numbers(values: np.ndarray) -> str:
