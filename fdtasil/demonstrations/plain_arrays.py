@@ -44,7 +44,7 @@ def from_arrays(
     Example:
         >>> import numpy as np
         >>> states = np.random.default_rng(0).standard_normal((6, 3))
-        >>> data = from_arrays(states, states[:, :1], episode_ends=[2, 6], low=-1, high=1)
+        >>> data = from_arrays(states, np.tanh(states[:, :1]), episode_ends=[2, 6], low=-1, high=1)
         >>> data.demonstrations.episode.tolist()
         [0, 0, 1, 1, 1, 1]
     """

@@ -254,7 +254,7 @@ class _Answers:
                 f"{self.expert.name} asked the same {rows:,} observations twice differs at "
                 f"{again:,} of them, by up to {farthest:.2g}"
             )
-            return Finding("determinism", measured, ExpertError(found, *_STOCHASTIC))
+            return Finding(name, measured, ExpertError(found, *_STOCHASTIC))
         found = (
             f"{self.expert.name} answers {wrong:,} of {rows:,} observations at once otherwise "
             f"than few, by up to {most:.2g}"
