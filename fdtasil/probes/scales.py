@@ -104,14 +104,21 @@ def measure_actions(actions: np.ndarray, choices: Iterable[tuple[int, int]] = ()
     return replace(own, mean=mean, scale=scale)
 
 
-def action_units(low: np.ndarray, high: np.ndarray, actions: Scales) -> np.ndarray:
+def action_units(
+    low: np.ndarray,
+    high: np.ndarray,
+    actions: np.ndarray,
+    choices: Iterable[tuple[int, int]] = (),
+) -> np.ndarray:
     """Return what each action is measured in, (m,): half of its range, or its own scale.
 
     Args:
         low: (m,) lower bounds.
         high: (m,) upper ones; where one of both is infinite, the scale counts.
-        actions: From `measure_actions`.
+        actions: (N, m) of the expert, as in `measure_actions`.
+        choices: As there.
     """
     with np.errstate(invalid="ignore"):  # of infinite bounds, which are not chosen
         half = (high.astype(np.float64) - low) / 2
-    return np.where(np.isfinite(half) & (half > 0), half, actions.scale)
+    scale = measure_actions(actions, choices).scale
+    return np.where(np.isfinite(half) & (half > 0), half, scale)

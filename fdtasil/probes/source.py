@@ -318,7 +318,7 @@ def _parse_text(spec: str) -> Probes:
         raise SettingError(f"probes={spec!r}", _GRAMMAR, _EXAMPLES) from None
     told: dict[str, str] = {}
     for option in options:
-        (field, value), *_ = _parse_option(option, spec).items()
+        field, value = _parse_option(option, spec)
         if field in told and fields[field] != value:
             found = f"probes={spec!r}: {told[field]!r} beside {option!r}"
             raise SettingError(found, "one of the two", "leave one out")
@@ -328,16 +328,16 @@ def _parse_text(spec: str) -> Probes:
     return Probes(directions, **fields)
 
 
-def _parse_option(option: str, spec: str) -> dict[str, object]:
+def _parse_option(option: str, spec: str) -> tuple[str, object]:
     key, _, value = option.partition("=")
     if not value and key in _FLAGS:
-        return dict([_FLAGS[key]])
+        return _FLAGS[key]
     known = ", ".join([*_FLAGS, *(f"{name}=..." for name in _NUMBERS)])
     if key not in _NUMBERS:
         found = f"probes={spec!r}: unknown option {option!r}"
         raise SettingError(found, f"one of {known}", _EXAMPLES)
     try:
-        return {key: _NUMBERS[key](value)}
+        return key, _NUMBERS[key](value)
     except ValueError:
         found = f"probes={spec!r}: {value!r} in {option!r}"
         raise SettingError(found, _LIKE[key], "write one of these") from None

@@ -4,7 +4,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fdtasil.probes.scales import action_units, measure_actions
+from fdtasil.probes.scales import action_units
 from fdtasil.rollouts.environments import EnvironmentPool
 from fdtasil.rollouts.episodes import Episodes
 
@@ -48,7 +48,7 @@ def smoothness_of(episodes: Episodes, pool: EnvironmentPool, expert: Episodes) -
         best = chosen.best(acted.reshape(-1, m)).reshape(*episodes.valid.shape, -1)
         return Smoothness(float((best[:, 1:] != best[:, :-1])[both].mean()), None)
     taken, _ = pool.bounds.put_inside(expert.actions[expert.valid])
-    units = action_units(pool.boxes.low, pool.boxes.high, measure_actions(taken))
+    units = action_units(pool.boxes.low, pool.boxes.high, taken)
     scaled = acted / units
     rough = float(np.abs(np.diff(scaled, axis=1))[both].mean())
     return Smoothness(rough, _high_frequency(scaled, episodes.lengths))

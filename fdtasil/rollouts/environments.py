@@ -19,7 +19,13 @@ from fdtasil.rollouts.spaces import Layout, Spaces, UnknownSpace, layout_of
 from fdtasil.rollouts.vector import Together, vector_of
 from fdtasil.rollouts.wanted import Environment
 
-__all__ = ["EnvironmentLike", "EnvironmentPool", "resolve_horizon", "simulator_warnings"]
+__all__ = [
+    "EnvironmentLike",
+    "EnvironmentPool",
+    "bounds_text",
+    "resolve_horizon",
+    "simulator_warnings",
+]
 
 EnvironmentLike = (
     str | gymnasium.Env | gymnasium.vector.VectorEnv | Callable[[], Any] | Environment
@@ -56,6 +62,21 @@ class Boxes:
     def bounded(self) -> np.ndarray:
         """(m,) bool, the actions that have both bounds."""
         return np.isfinite(self.low) & np.isfinite(self.high)
+
+
+def bounds_text(low: np.ndarray, high: np.ndarray) -> str:
+    """Return the bounds of actions in words: one number where all are equal, else the first."""
+    return f"{_ends_text(low)} to {_ends_text(high)}"
+
+
+def _ends_text(bounds: np.ndarray) -> str:
+    if (bounds == bounds[0]).all():
+        return f"{bounds[0]:g}"
+    more = ", ..." if len(bounds) > _SHOWN else ""
+    return f"[{', '.join(f'{bound:g}' for bound in bounds[:_SHOWN])}{more}]"
+
+
+_SHOWN = 6  # bounds that differ
 
 
 @dataclass(frozen=True)

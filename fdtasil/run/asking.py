@@ -12,7 +12,7 @@ from fdtasil.probes.answers import FROM_THE_START, Answers, Beginning, ask_probe
 from fdtasil.probes.calibration import Calibration, calibrate
 from fdtasil.probes.derivatives import check_derivatives, comparison_rows
 from fdtasil.probes.device_twin import DeviceTwin
-from fdtasil.probes.scales import Scales, action_units, measure_actions
+from fdtasil.probes.scales import Scales, action_units
 from fdtasil.probes.surroundings import Surroundings
 from fdtasil.run.account import Account
 from fdtasil.run.configuration import Configuration
@@ -45,8 +45,7 @@ class Asking:
         run, expert = self._run, self._expert
         if run.calibrated and self.calibration is None and expert is not None:
             states, random = dataset.demonstrations, generator(run.seed, "calibration")
-            actions = measure_actions(states.actions, dataset.choices)
-            units = action_units(dataset.low, dataset.high, actions)
+            units = action_units(dataset.low, dataset.high, states.actions, dataset.choices)
             about = scales, random, run.usual_radius, run.ladder, units
             self.take_up(calibrate(expert, states.observations, *about))
 

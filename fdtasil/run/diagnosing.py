@@ -14,7 +14,7 @@ from fdtasil.experts.examination import examine
 from fdtasil.experts.expert import Expert
 from fdtasil.experts.load import ExpertLike, expert_in, sized
 from fdtasil.probes.calibration import calibrate
-from fdtasil.probes.scales import Scales, action_units, measure_actions, measure_scales
+from fdtasil.probes.scales import Scales, action_units, measure_scales
 from fdtasil.progress import Progress
 from fdtasil.results.conditions import conditions_of, errors_of
 from fdtasil.results.diagnosis import Diagnosis
@@ -245,7 +245,7 @@ class _Pair:
         """Return how the expert answers; None where it does not, or always the same."""
         visited, boxes = own.observations[own.valid], self.pool.boxes
         moved = ~np.isin(np.arange(visited.shape[1]), list(self._held))
-        units = action_units(boxes.low, boxes.high, measure_actions(own.actions[own.valid]))
+        units = action_units(boxes.low, boxes.high, own.actions[own.valid])
         about = measure_scales(visited, moved), generator(self.seed, "calibration")
         with suppress(ExpertError):
             found = calibrate(

@@ -9,12 +9,12 @@ import numpy as np
 
 from fdtasil.checks import spelt
 from fdtasil.demonstrations.dataset import Dataset, warn_of_bounds
-from fdtasil.errors import SettingError, shown, warn
+from fdtasil.errors import SettingError, warn
 from fdtasil.experts.carrying import carry
 from fdtasil.experts.expert import Expert
 from fdtasil.experts.load import ExpertLike, expert_in, load_expert
 from fdtasil.experts.structure import in_spaces
-from fdtasil.rollouts.environments import EnvironmentLike, EnvironmentPool
+from fdtasil.rollouts.environments import EnvironmentLike, EnvironmentPool, bounds_text
 from fdtasil.rollouts.history import past_size
 from fdtasil.rollouts.naming import columns_named
 from fdtasil.rollouts.spaces import Layout, Spaces
@@ -125,8 +125,8 @@ def bounded(given: Dataset, pool: EnvironmentPool) -> Dataset:
         np.where(np.isfinite(said), said, own).astype(np.float32)
         for said, own in ((given.low, boxes.low), (given.high, boxes.high))
     )
-    theirs = f"{pool.name} has the action bounds {_shown(boxes.low)} to {_shown(boxes.high)}"
-    found = f"a dataset with the action bounds {_shown(given.low)} to {_shown(given.high)}"
+    theirs = f"{pool.name} has the action bounds {bounds_text(boxes.low, boxes.high)}"
+    found = f"a dataset with the action bounds {bounds_text(given.low, given.high)}"
     if not (low < high).all():
         raise SettingError(found, theirs, "leave low= and high= out of from_arrays")
     if not (np.allclose(low, boxes.low) and np.allclose(high, boxes.high)):
@@ -135,18 +135,6 @@ def bounded(given: Dataset, pool: EnvironmentPool) -> Dataset:
     if not (np.array_equal(low, given.low) and np.array_equal(high, given.high)):
         warn_of_bounds(whole)
     return whole
-
-
-def _shown(bounds: np.ndarray) -> str:
-    """Return one number where all are equal, else the first of them."""
-    if (bounds == bounds[0]).all():
-        return f"{bounds[0]:g}"
-    return shown(
-        ", ".join(f"{bound:g}" for bound in bounds[:_FEW]) + ", ..." * (len(bounds) > _FEW)
-    )
-
-
-_FEW = 6
 
 
 def history_with(history: int, given: Dataset | None) -> int:

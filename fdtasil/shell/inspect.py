@@ -3,16 +3,14 @@
 from pathlib import Path
 from typing import Literal
 
-import numpy as np
-
 from fdtasil.checks import check_count, check_suffix
 from fdtasil.errors import printable, without_secrets
 from fdtasil.experts.examination import Looked, look_closely
 from fdtasil.files.storage import write_bytes
 from fdtasil.probes.calibration import Calibration, calibrate
-from fdtasil.probes.scales import action_units, measure_actions, measure_scales
+from fdtasil.probes.scales import action_units, measure_scales
 from fdtasil.results.figures import draw_calibration
-from fdtasil.rollouts.environments import EnvironmentPool
+from fdtasil.rollouts.environments import EnvironmentPool, bounds_text
 from fdtasil.rollouts.wanted import import_module_of
 from fdtasil.run.presets import PRESETS
 from fdtasil.seeding import generator
@@ -21,7 +19,6 @@ from fdtasil.shell.command import EnvironmentId, ExpertPath
 
 __all__ = ["command"]
 
-_SHOWN = 6  # bounds that differ
 _CHANCE = "  (no worse than the expert: does it belong to this environment and version?)"
 
 
@@ -109,15 +106,7 @@ def _actions(pool: EnvironmentPool) -> str:
     if choices:
         counts = ", ".join(str(stop - start) for start, stop in choices)
         return f"{boxes.action_size} scores of choices, of {counts} each"
-    return f"{boxes.action_size}, from {_ends(boxes.low)} to {_ends(boxes.high)}"
-
-
-def _ends(bounds: np.ndarray) -> str:
-    """Return one number where all are equal, else the first of them."""
-    if (bounds == bounds[0]).all():
-        return f"{bounds[0]:g}"
-    more = ", ..." if len(bounds) > _SHOWN else ""
-    return f"[{', '.join(f'{bound:g}' for bound in bounds[:_SHOWN])}{more}]"
+    return f"{boxes.action_size}, from {bounds_text(boxes.low, boxes.high)}"
 
 
 def _calibrated(looked: Looked, pool: EnvironmentPool, seed: int) -> Calibration | None:
@@ -125,8 +114,8 @@ def _calibrated(looked: Looked, pool: EnvironmentPool, seed: int) -> Calibration
         return None
     visited, random = looked.own.observations[looked.own.valid], generator(seed, "calibration")
     scales, radius = measure_scales(visited), PRESETS["standard"].radius
-    actions = measure_actions(looked.own.actions[looked.own.valid], pool.spaces.actions.choices)
-    units = action_units(pool.boxes.low, pool.boxes.high, actions)
+    low, high, choices = pool.boxes.low, pool.boxes.high, pool.spaces.actions.choices
+    units = action_units(low, high, looked.own.actions[looked.own.valid], choices)
     return calibrate(looked.expert, visited, scales, random, radius, units=units)
 
 
