@@ -220,3 +220,19 @@ def test_another_expert_is_found_by_an_action_in_small_numbers_too(unit, tmp_pat
         fdtasil.distill(law, scaled_actions(unit), out=tmp_path, callback=lambda _: 1 / 0, **run)
     with pytest.raises(SettingError, match="begun with another expert"):
         fdtasil.distill(other, scaled_actions(unit), resume=tmp_path, **run)
+
+
+@pytest.mark.fault(274)
+@pytest.mark.parametrize("unit", [1, 1000])
+def test_a_change_of_an_action_in_small_numbers_is_found_at_the_end(unit):
+    changed = []  # told by the last event, before the expert is asked again
+
+    def law(rows):
+        return np.tanh(rows[:, :2]) * [unit, -1.0 if changed else 1.0]
+
+    def change(event):
+        if event.kind == "evaluation":
+            changed.append(event)
+
+    with pytest.warns(FdtasilWarning, match="has changed during the run.*altogether other"):
+        fdtasil.distill(law, scaled_actions(unit), 1, callback=change, **QUICK)

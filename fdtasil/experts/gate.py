@@ -10,7 +10,7 @@ from fdtasil.errors import ExpertError, FdtasilError, warn
 from fdtasil.experts.expert import Expert
 from fdtasil.experts.silence import check_answered
 from fdtasil.rollouts.behaviours import farthest_apart, has_none
-from fdtasil.rollouts.environments import Boxes
+from fdtasil.rollouts.environments import Boxes, bounds_text
 
 __all__ = [
     "GATE_QUERIES",
@@ -150,7 +150,9 @@ def admit_expert(
     raise_problems(findings, force=force)
 
 
-def compare_again(expert: Expert, observations: np.ndarray, answers: np.ndarray) -> None:
+def compare_again(
+    expert: Expert, observations: np.ndarray, answers: np.ndarray, units: np.ndarray
+) -> None:
     """Ask an expert again at the end of a run, and warn where it answers otherwise than before.
 
     It is no error: what was trained would be lost by it.
@@ -159,6 +161,7 @@ def compare_again(expert: Expert, observations: np.ndarray, answers: np.ndarray)
         expert: The expert.
         observations: (N, n) states of the run.
         answers: (N, m) what it answered there.
+        units: (m,) what each action is measured in.
     """
     chosen = np.linspace(0, len(observations) - 1, GATE_STATES).round().astype(int)
     before = answers[chosen]
@@ -171,19 +174,20 @@ def compare_again(expert: Expert, observations: np.ndarray, answers: np.ndarray)
     if none.all():
         warn("asked again at the end of the run, the expert has no answer where it had one")
         return
-    difference = float(np.abs(now - before)[~none].max())
-    spread = max(1.0, float(np.abs(answers).max()))
-    if difference <= _SAME * spread:
+    apart = np.abs(now - before)[~none]
+    farther = apart.max(axis=0) / units
+    if farther.max() <= _SAME:
         return
-    usual = float(np.abs(before - before.mean(axis=0)).max())
+    usual = np.abs(before - before.mean(axis=0)).max(axis=0) / units
+    most = apart[:, farther.argmax()].max()
     other = (
         "altogether other actions, so do not rely on this student: "
-        if (difference > max(usual, _SAME * spread))
+        if (farther > np.maximum(usual, _SAME)).any()
         else ""
     )
     warn(
         f"{expert.name} has changed during the run: asked again at {GATE_STATES} states, its "
-        f"answers differ by up to {difference:.2g} from those at the beginning; {other}"
+        f"answers differ by up to {most:.2g} from those at the beginning; {other}"
         "look for memory, noise or a clock in it, or for a server whose model was replaced"
     )
 
@@ -280,7 +284,7 @@ class _Answers:
         )
         problem = ExpertError(
             found,
-            f"actions from {_numbers(low)} to {_numbers(high)}",
+            f"actions from {bounds_text(low, high)}",
             "put scaling and clipping inside the expert, or pass force=True (--force on the "
             "command line) to let the environment clip",
         )
@@ -291,7 +295,8 @@ class _Answers:
         sizes = np.abs(self.answers)
         largest, saturated = float(sizes.max()), float((sizes > 0.99).mean())
         wider = float(min(-self.boxes.low.max(), self.boxes.high.min()))
-        measured = f"largest action {largest:.3g}, bounds {_numbers(self.boxes.high)}"
+        bounds = bounds_text(self.boxes.low, self.boxes.high)
+        measured = f"largest action {largest:.3g}, bounds {bounds}"
         if 1.5 <= wider < np.inf and largest <= 1.0 + 1e-6 and saturated > 0.1:
             warn(
                 f"all actions of {self.expert.name} lie in [-1, 1], the bounds are +-{wider:.3g}: "
@@ -305,8 +310,3 @@ class _Answers:
         sizes = np.abs(self.answers).max(axis=0)
         seen = np.maximum(np.ptp(self.answers, axis=0), _LEAST * sizes)
         return np.where(np.isfinite(width), width, np.where(seen > 0, seen, 1.0))
-
-
-def _numbers(values: np.ndarray) -> str:
-    """Return one number where all are equal, else the list."""
-    return f"{values[0]:g}" if np.all(values == values[0]) else str(values)

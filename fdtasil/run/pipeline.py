@@ -16,6 +16,7 @@ from fdtasil.experts.expert import Expert
 from fdtasil.experts.gate import GATE_STATES, compare_again
 from fdtasil.experts.load import ExpertLike
 from fdtasil.experts.silence import Silence
+from fdtasil.probes.scales import action_units
 from fdtasil.probes.source import Probes
 from fdtasil.probes.spread import SpreadLike
 from fdtasil.progress import Progress
@@ -374,9 +375,13 @@ def _ask_again(
     """Warn of an expert that answers otherwise than at the beginning."""
     if expert is None or not run.horizon:
         return
+    recorded = lesson.collected.dataset
     if theirs is not None:
-        valid = theirs.valid
-        compare_again(expert, theirs.observations[valid], theirs.actions[valid])
+        observations, actions = theirs.observations[theirs.valid], theirs.actions[theirs.valid]
     elif run.trainer is not None:
-        states = lesson.collected.dataset.demonstrations
-        compare_again(expert, states.observations, states.actions)
+        states = recorded.demonstrations
+        observations, actions = states.observations, states.actions
+    else:
+        return
+    units = action_units(recorded.low, recorded.high, actions)
+    compare_again(expert, observations, actions, units)
