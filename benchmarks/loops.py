@@ -38,7 +38,7 @@ def run(cell: Cell, device: str) -> dict[str, Any]:
 def draw(rows: Sequence[Row]) -> dict[str, bytes]:
     """One table: experts down."""
     text = "The factor by which a deviation changes in each step after a single action was\n"
-    text += "disturbed: median of the seeds that have one, the least and the largest. The largest\n"
+    text += "disturbed: median of the seeds that have one, the least, the largest. The largest\n"
     text += "eigenvalue of one step of the closed loop, over the states of all seeds.\n\n"
     experts = dict.fromkeys(row["cell"]["expert"] for row in rows)
     lines = [
