@@ -37,8 +37,8 @@ class Progress:
     """
 
     def __init__(self, shown: bool) -> None:
-        # None lets tqdm look whether there is a terminal.
-        self._disable = (False if _in_a_notebook() else None) if shown else True
+        # A program without a console has no stderr; None lets tqdm look for a terminal.
+        self._disable = (False if _in_a_notebook() else None) if shown and sys.stderr else True
 
     @contextmanager
     def bar(self, title: str, unit: str, total: int | None = None) -> Iterator[Bar]:

@@ -423,6 +423,7 @@ class Several(torch.nn.Module):
     [
         (lambda rows: {"u": rows[:, :2], "v": rows[:, 4:]}, "u", "u, v"),
         (lambda rows: (rows[:, 4:], rows[:, :2], rows[:, :1]), "1", "0, 1, 2"),
+        (lambda rows: (rows[:, 4:], rows[:, :2], rows[:, :1]), 1, "0, 1, 2"),
         (Several(), "actions", "actions, value"),
     ],
 )

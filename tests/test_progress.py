@@ -9,6 +9,7 @@ import pytest
 from conftest import TOY
 
 import fdtasil
+from fdtasil.progress import Progress
 
 CODE = """
 import fdtasil
@@ -45,3 +46,9 @@ def test_in_a_real_kernel(progress, monkeypatch):
     nbclient.NotebookClient(notebook, timeout=120, kernel_name="python3").execute()
     told = "".join(output.get("text", "") for output in cell.outputs)
     assert ("step/s" in told) is progress
+
+
+def test_a_program_without_a_console_has_no_bars(monkeypatch):
+    monkeypatch.setattr(sys, "stderr", None)
+    with Progress(True).bar("fit", "step", 3) as bar:
+        bar.move(1)

@@ -155,8 +155,9 @@ def test_every_trainer_on_a_dictionary(trainer, probes):
 
 
 def test_the_student_sees_parts_by_name():
-    result = distilled("dictionary", student_obs=["place", "speed"])
+    result = distilled("dictionary", student_obs=["speed", "place"])  # in no order
     assert result.student.observation_size == 4
+    assert result.student.spaces.observations.names == ("place", "speed")
     seen = {"place": np.zeros(2), "speed": np.ones(2)}
     flat = result.student.predict(np.array([0, 0, 1, 1], np.float32))[0]
     assert result.student.predict(seen)[0] == pytest.approx(flat)

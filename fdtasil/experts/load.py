@@ -59,7 +59,7 @@ def load_expert(
     observation_size: int | None = None,
     action_size: int | None = None,
     *,
-    output: str | None = None,
+    output: str | int | None = None,
     inputs: Inputs | None = None,
     memory: Mapping[str, str] | None = None,
     batch: int | None = None,
@@ -117,9 +117,13 @@ def load_expert(
             check_count(name, size)
     if trust is not None:
         check_choice("trust", trust, ("pickle", "c"))
+    if isinstance(output, int) and not isinstance(output, bool):
+        output = str(output)
     if output is not None and not isinstance(output, str):
         example = "leave it out, or write the name that a viewer of ONNX files shows"
-        raise SettingError(spelt("output", output), "the name of an output", example)
+        raise SettingError(
+            spelt("output", output), "the name of an output, or the number of a part", example
+        )
     threads = check_flag("threads", threads)
     bound = None if inputs is None else check_inputs(inputs)
     kind = _kind_of(source)

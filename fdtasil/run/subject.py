@@ -159,6 +159,8 @@ def named(
 ) -> StudentObservation | None:
     """Return the columns of parts that are said by their names; what else is said as it is.
 
+    The parts stay in the order of the space, in which everybody else reads them.
+
     Raises:
         SettingError: If there is no such part.
     """
@@ -167,7 +169,7 @@ def named(
         return student_obs
     said, example = spelt("student_obs", student_obs), "write indices, such as 0 1 2"
     columns = (columns_named(str(name), observations, said, example) for name in names)
-    return tuple(dict.fromkeys(chain.from_iterable(columns)))
+    return tuple(sorted({*chain.from_iterable(columns)}))
 
 
 def visible(
