@@ -116,5 +116,5 @@ def test_a_resumed_run_takes_the_calibration_up(tmp_path):
 
 
 def test_a_student_that_sees_nothing_move_is_told_so(linear):
-    with pytest.raises(SettingError, match="sees no coordinate that moves"):
+    with pytest.raises(SettingError, match="sees no coordinate that can be probed"):
         fdtasil.distill(linear, TOY, 3, student_obs=[4], **QUICK)

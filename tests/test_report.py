@@ -13,6 +13,7 @@ import fdtasil
 from fdtasil.errors import FdtasilWarning
 from fdtasil.results.card import card_of
 from fdtasil.results.page import page_of
+from fdtasil.results.summary import call_of
 
 pytestmark = pytest.mark.usefixtures("no_pictures")
 
@@ -154,3 +155,22 @@ def test_a_student_that_is_judged_elsewhere_is_noticed(tmp_path):
             with pytest.warns(FdtasilWarning, match="distilled in Pendulum-v1, and is judged in"):
                 judge(student, swing, "Other/Pendulum-v0", episodes=2, horizon=20)
     assert "<pre>" in fdtasil.diagnose(run, swing, "Pendulum-v1", episodes=2)._repr_html_()
+
+
+@pytest.mark.fault(271)
+def test_an_environment_that_is_more_than_its_id_is_left_to_the_reader():
+    def swing(rows):
+        return np.clip(-8 * np.arctan2(rows[:, 1:2], rows[:, :1]) - 2 * rows[:, 2:], -2, 2)
+
+    moon = fdtasil.Environment("Pendulum-v1", kwargs={"g": 1.6})
+    made = {"kwargs={'g': 1.6}": moon, "made by make_pendulum": make_pendulum}
+    for said, env in made.items():
+        run = fdtasil.distill(swing, env, 2, **QUICK)
+        assert f"env = ...  # Pendulum-v1, {said}\n" in call_of(run.settings, 1)
+        fdtasil.evaluate(run, swing, env, episodes=2, horizon=20)  # says nothing
+    with pytest.warns(FdtasilWarning, match="in another Pendulum-v1 than it is judged in: its ob"):
+        fdtasil.evaluate(run, swing, moon, episodes=2, horizon=20)
+
+
+def make_pendulum():
+    return gymnasium.make("Pendulum-v1", g=3.0)

@@ -297,7 +297,7 @@ class OldGym(Integrator):
         ),
         (odd_reset(lambda x, info, _: (x,)), "returned 1 things", "observation, {}"),
         (odd_reset(lambda x, info, _: tuple(x[:2])), "returned a float64 in place of info", "{}"),
-        (odd_reset(lambda x, info, o: (x + o["goal"], {})), "NoneType", "options={...}"),
+        (odd_reset(lambda x, info, o: (x + o["goal"], {})), "NoneType", "reset_options={...}"),
         (OldGym, "unexpected keyword argument 'seed'", "seed=None, options=None"),
     ],
 )
@@ -310,13 +310,27 @@ def test_a_reset_of_another_kind_has_its_own_cause_and_next_step(environment, fo
 
 
 @pytest.mark.fault(182)
-def test_the_wrapper_that_the_error_of_options_names_works(linear):
-    class WithOptions(gymnasium.Wrapper):
-        def reset(self, *, seed=None, options=None):
-            return self.env.reset(seed=seed, options={"goal": 0.0})
-
+def test_what_the_error_of_options_names_works(linear):
     needs = odd_reset(lambda x, info, options: (x + options["goal"], {}))
-    assert fdtasil.distill(linear, lambda: WithOptions(needs()), 1, **QUICK).evaluation
+    told = fdtasil.Environment(needs, reset_options={"goal": 0.0})
+    assert fdtasil.distill(linear, told, 1, **QUICK).evaluation
+
+
+def test_an_environment_that_can_be_open_once_is_played_alone(linear):
+    class Port(Integrator):
+        used = False
+
+        def __init__(self):
+            super().__init__()
+            if Port.used:
+                raise OSError("port in use")
+            Port.used = True
+
+    with pytest.warns(FdtasilWarning, match="made 2 times .*port in use.*played in 1 at once"):
+        alone = fdtasil.distill(linear, Port, 1, **QUICK)
+    many = fdtasil.distill(linear, Integrator, 1, **QUICK)
+    # A batch of one row has other last bits.
+    assert np.allclose(alone.evaluation.student_returns, many.evaluation.student_returns, rtol=1e-3)
 
 
 class Rude(Exception):

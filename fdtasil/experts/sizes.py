@@ -39,4 +39,7 @@ def size_hint(ours: int, theirs: int) -> str:
             "check the environment's options; one or two more are often positions, by "
             "exclude_current_positions_from_observation=False"
         )
-    return "check the environment's version, options and wrappers"
+    return (
+        "check the environment's version, options and wrappers; judge a student with the history= "
+        "or student_obs= that it was distilled with"
+    )

@@ -63,8 +63,8 @@ class Scales:
         chosen = self.seen if space == "raw" else self.seen & self.live
         if not chosen.any():
             raise SettingError(
-                "the student sees no coordinate that moves",
-                "at least one",
+                "the student sees no coordinate that can be probed",
+                "one that moves, and is no choice and no whole number",
                 "check student_obs, or pass probes=0",
             )
         return chosen

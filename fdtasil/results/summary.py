@@ -50,7 +50,7 @@ def call_of(settings: Mapping[str, Any], history: int) -> str:
     """Return the call of a run, as far as its settings say it.
 
     Functions, datasets, and environments that gymnasium does not know stand in no file: they are
-    named, and left to the reader; so is what an environment is made with.
+    named, and left to the reader; so are environments that are more than their id.
 
     Args:
         settings: Of the run's configuration.
@@ -119,12 +119,16 @@ def _in_no_file(settings: Mapping[str, Any]) -> dict[str, str]:
     is_address = is_http_url(expert) or is_hub_uri(expert)
     found = {
         "expert": None if settings.get("expert_sha256") or is_address else expert,
-        "env": None if _is_registered(env) else env,
+        "env": _environment_in_words(env, settings.get("made")),
         "dataset": data and f"sha256 {data}",
     }
     return {name: said for name, said in found.items() if said is not None}
 
 
-def _is_registered(name: object) -> bool:
-    """Whether gymnasium makes an environment of that name, once its module is imported."""
-    return isinstance(name, str) and (":" in name or name in gymnasium.registry)
+def _environment_in_words(name: str | None, made: str | None) -> str | None:
+    """Return what an environment is; None where gymnasium makes it of its name alone."""
+    if made is not None:
+        return f"{name}, {made}"
+    # "module:Id" is registered once the module is imported.
+    known = name is not None and (":" in name or name in gymnasium.registry)
+    return None if known else name

@@ -119,6 +119,7 @@ class EnvironmentPool:
 
     Attributes:
         name: What messages call it.
+        made: How it is made and reset, in words; None where its id says it all.
         time_limit: Steps after which it ends an episode itself, or None.
         spaces: Its spaces.
         boxes: The same, flat.
@@ -140,6 +141,7 @@ class EnvironmentPool:
     def __init__(self, environment: EnvironmentLike) -> None:
         wanted = environment if isinstance(environment, Environment) else Environment(environment)
         self.options, given = wanted.reset_options, wanted.environment
+        self.made = wanted.made
         self._owned = isinstance(given, str) or (
             callable(given) and not isinstance(given, gymnasium.Env)
         )
@@ -186,15 +188,25 @@ class EnvironmentPool:
         return {} if self.options is None else {"options": copy.deepcopy(self.options)}
 
     def take(self, count: int) -> list[gymnasium.Env]:
-        """Return up to `count` copies; fewer where only one exists."""
+        """Return up to `count` copies; fewer where only one exists, or can be open at once."""
+        refused = None
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # the first copy has said it all
             while self._owned and not self._single and len(self._members) < count:
-                made = self._flat(self._checked(self._new()))
+                try:
+                    made = self._flat(self._checked(self._new()))
+                except EnvironmentFault as error:  # a port, or a window, that is in use
+                    refused, self._single = error, True
+                    break
                 if any(made.unwrapped is member.unwrapped for member in self._members):
                     self._owned = False  # a factory that hands out one and the same
                     break
                 self._members.append(made)
+        if refused is not None:
+            warn(
+                f"{self.name} can't be made {len(self._members) + 1} times ({refused.found}): "
+                f"episodes are played in {len(self._members)} at once"
+            )
         return self._members[:count]
 
     def wrap(self, wrapper: Callable[[gymnasium.Env], gymnasium.Env]) -> None:

@@ -321,9 +321,8 @@ def _reset_advice(error: Exception) -> str | None:
     looked_up = isinstance(error, AssertionError | KeyError) and inside.get("options", "") is None
     if "options" in said or "'NoneType' object" in said or looked_up:
         return (
-            "if it needs options, give them in a wrapper: class WithOptions(gymnasium.Wrapper): "
-            "def reset(self, *, seed=None, options=None): "
-            "return self.env.reset(seed=seed, options={...})"
+            "if it needs options, pass fdtasil.Environment(env, reset_options={...}), "
+            "--reset-options in a shell"
         )
     return None
 

@@ -11,7 +11,7 @@ from typing import Any
 import gymnasium
 
 from fdtasil.checks import check_count, spelt
-from fdtasil.errors import EnvironmentFault, SettingError
+from fdtasil.errors import EnvironmentFault, SettingError, shown
 from fdtasil.rollouts.vector import make_vector, vector_of
 
 __all__ = ["Environment", "import_module_of"]
@@ -59,6 +59,18 @@ class Environment:
                 "an id of gymnasium, which is made with it",
                 "pass a function that makes it so, such as lambda: MyEnv(limit=50)",
             )
+
+    @property
+    def made(self) -> str | None:
+        """How it is made and reset, in words; None where its id says it all."""
+        told = []
+        if not isinstance(self.environment, str):
+            called = getattr(self.environment, "__name__", None)
+            told.append(f"made by {called}" if called else "made by the caller")
+        for name in ("kwargs", "reset_options"):
+            if getattr(self, name):
+                told.append(f"{name}={dict(getattr(self, name))!r}")
+        return shown(", ".join(told)) if told else None
 
     def factory(self) -> Callable[[], Any]:
         """Return what makes one.

@@ -158,6 +158,7 @@ class Arguments:
             fingerprint=fingerprint(subject.pool, start) if subject.pool else None,
             reason=None,
             spaces=subject.spaces,
+            made=subject.pool.made if subject.pool else None,
         )
 
     def _spread(self, subject: Subject) -> Spread:

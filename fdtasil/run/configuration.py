@@ -59,6 +59,7 @@ class Configuration:
         remembered: Length of the expert's memory; 0 where it has none.
         own_derivatives: Whether the expert gives the derivatives that are matched.
         spaces: Of the environment, where they are no plain boxes.
+        made: How the environment is made and reset, in words, where its id does not say it.
     """
 
     expert: str | None
@@ -90,6 +91,7 @@ class Configuration:
     remembered: int = 0
     own_derivatives: bool = False
     spaces: Spaces | None = None
+    made: str | None = None
 
     @property
     def held(self) -> tuple[int, ...]:

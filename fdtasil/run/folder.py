@@ -31,6 +31,7 @@ CHECKPOINT_SECONDS = 20.0
 
 _CONFIG_LIMIT = 2**24
 _FINGERPRINT = "fingerprint"
+_MADE = "made"  # in words: the fingerprint tells whether it is the same
 _FREE = "max_queries"  # what a run is allowed to ask changes none of its bytes
 _REASON = "reason"  # follows from what may be another
 
@@ -207,7 +208,7 @@ def _read_config(path: Path) -> dict[str, Any]:
 def _check_same(
     before: dict[str, Any], now: dict[str, Any], path: Path, *, finished: bool
 ) -> None:
-    left_out = {_FREE: None, _REASON: None, _FINGERPRINT: None}
+    left_out = {_FREE: None, _REASON: None, _FINGERPRINT: None, _MADE: None}
     if before.get("expert_sha256") is not None and before["expert_sha256"] == now["expert_sha256"]:
         left_out["expert"] = None  # the same file, wherever it lies now
     changed = _differences({**before, **left_out}, {**now, **left_out})

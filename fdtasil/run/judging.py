@@ -5,6 +5,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import gymnasium
+import numpy as np
 
 from fdtasil.checks import check_count
 from fdtasil.errors import SettingError, warn
@@ -15,6 +16,7 @@ from fdtasil.experts.structure import in_spaces
 from fdtasil.results.distilled import Distilled
 from fdtasil.rollouts.environments import EnvironmentPool
 from fdtasil.rollouts.spaces import Spaces, flat_layout
+from fdtasil.rollouts.trials import fingerprint, other_environment
 from fdtasil.student.policy import Student
 from fdtasil.student.view import StudentObservation, Unseen
 
@@ -40,10 +42,24 @@ def finished_run(policy: ExpertLike | Distilled) -> ExpertLike | Distilled:
 
 def warn_of_another_environment(policy: ExpertLike | Distilled, pool: EnvironmentPool) -> None:
     """Warn where a run's student is judged elsewhere than it was distilled."""
-    if isinstance(policy, Distilled):
-        names = policy.settings["env"], pool.name
-        if names[0] != names[1] and all(name in gymnasium.registry for name in names):
-            warn(f"the student was distilled in {names[0]}, and is judged in {names[1]}")
+    if not isinstance(policy, Distilled):
+        return
+    names = policy.settings["env"], pool.name
+    if names[0] != names[1] and all(name in gymnasium.registry for name in names):
+        warn(f"the student was distilled in {names[0]}, and is judged in {names[1]}")
+        return
+    before = policy.settings.get("fingerprint")
+    if not isinstance(before, dict):
+        return  # of an earlier fdtasil, or of an environment that does not repeat itself
+    seed = before.get("seed")
+    if not isinstance(seed, int) or not 0 <= seed < 2**32:
+        return
+    now = fingerprint(pool, seed)
+    # An observation with a past behind it has another length.
+    if now is None or np.shape(now["observation"]) != np.shape(before.get("observation", ())):
+        return
+    if other := other_environment(before, now):
+        warn(f"the student was distilled in another {names[0]} than it is judged in: {other[0]}")
 
 
 def judged_through(

@@ -26,8 +26,8 @@ def _with_choices(model: "onnx.ModelProto", actions: Layout) -> "onnx.ModelProto
         actions: Of the environment.
 
     Returns:
-        One with the outputs `scores` (batch, m) and `actions`: (batch) int64 for one choice,
-        (batch, c) for several.
+        One with the outputs `scores` (batch, m) and `actions`: int64, (batch) for one choice,
+        (batch, c) for those of several parts, else in the shape of the space.
     """
     from onnx import TensorProto, helper
 
@@ -43,15 +43,17 @@ def _with_choices(model: "onnx.ModelProto", actions: Layout) -> "onnx.ModelProto
         chosen = nodes.node("ArgMax", mine, axis=1, keepdims=1)
         best.append(nodes.node("Add", chosen, nodes.integers([offset])))
     joined = nodes.node("Concat", *best, axis=1)
-    single = len(actions.parts) == 1 and not actions.parts[0].shape
-    if single:
+    single = len(actions.parts) == 1
+    shape = actions.parts[0].shape if single else (len(best),)
+    if not shape:
         nodes.node("Squeeze", joined, nodes.integers([1]))
+    elif len(shape) > 1:
+        nodes.node("Reshape", joined, nodes.integers([0, *shape]))
     nodes.name_last(_ANSWER)
     nodes.put_behind(model)
     (scores,) = model.graph.output
     scores.name = "scores"
-    shape = ["batch"] if single else ["batch", len(best)]
-    kind = helper.make_tensor_value_info(_ANSWER, TensorProto.INT64, shape)
+    kind = helper.make_tensor_value_info(_ANSWER, TensorProto.INT64, ["batch", *shape])
     model.graph.output.append(kind)
     return model
 
