@@ -290,3 +290,28 @@ def test_the_copy_in_numpy_chooses_too(tmp_path):
     loaded = PlainPolicy.load(tmp_path / "run" / "student.safetensors")
     assert plain.choices == loaded.choices != ()
     assert np.array_equal(plain.choose(states), loaded.choose(states))
+
+
+def test_choices_in_rows_keep_their_shape_in_the_file(tmp_path):
+    class Square(gymnasium.Env):
+        observation_space = gymnasium.spaces.Box(-1, 1, (3,))
+        action_space = gymnasium.spaces.MultiBinary([2, 2])
+
+        def reset(self, *, seed=None, options=None):
+            super().reset(seed=seed)
+            return self.np_random.uniform(-1, 1, 3).astype(np.float32), {}
+
+        def step(self, action):
+            seen = self.np_random.uniform(-1, 1, 3).astype(np.float32)
+            return seen, float(action.sum()), False, False, {}
+
+    def switches(rows):
+        return (np.asarray(rows)[:, [0, 1, 2, 0]] > 0).astype(np.int8).reshape(-1, 2, 2)
+
+    result = fdtasil.distill(switches, Square, 3, **QUICK)
+    result.export(tmp_path / "square.onnx")
+    rows = result.demonstrations.observations[:5]
+    session = onnxruntime.InferenceSession(tmp_path / "square.onnx")
+    (chosen,) = session.run(["actions"], {"obs": rows})
+    assert chosen.shape == (5, 2, 2)
+    assert np.array_equal(chosen, result.student.predict(rows)[0])

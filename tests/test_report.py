@@ -74,6 +74,7 @@ def test_the_command_and_the_card_of_a_folder(quick_folder, inside, tmp_path):
         {"history": 2},
         {"spread": {4: 0.5}},
         {"trainer": fdtasil.DAgger(beta=0.25), "episodes": 3},
+        {"student_obs": np.sin},
     ],
     ids=str,
 )
@@ -82,8 +83,9 @@ def test_the_call_of_the_card_repeats_the_run(further, linear):
     result = fdtasil.distill(linear, TOY, 3, **(QUICK | further))
     block = re.search(r"```python\n(.*?)```", card_of(result), re.S)[1]
     assert "expert = ...  # the function <lambda>\n" in block
-    code = re.sub(r"(?m)^expert = .*$", "", block).replace(repr(result.settings["env"]), "env")
-    session = {"expert": linear, "env": TOY}
+    code = re.sub(r"(?m)^(expert|student_obs) = .*$", "", block)
+    code = code.replace(repr(result.settings["env"]), "env")
+    session = {"expert": linear, "env": TOY} | further
     exec(code, session)
     assert session["result"].student.to_bytes() == result.student.to_bytes()
 

@@ -56,7 +56,7 @@ def open_onnx(source: str | Path, hints: Hints) -> Expert:
         ExpertError: If the file can't be opened, or its signature does not fit.
     """
     path = Path(source)
-    if path.suffix in (".safetensors", ".py", ".h"):
+    if path.suffix in (".safetensors", ".py", ".h", ".tflite"):
         raise ExpertError(
             f"{path}, which is no ONNX file",
             "an .onnx file, an agent's .zip, or a .c file",

@@ -214,7 +214,7 @@ class Distilled:
             "a run folder written by this version of fdtasil",
             "check the path, or run distill again",
         )
-        return read(cls._read)(Path(folder), student_obs)
+        return read(cls._read)(check_path("folder", folder), student_obs)
 
     @classmethod
     def _read(cls, folder: Path, student_obs: StudentObservation | None) -> "Distilled":

@@ -71,7 +71,7 @@ def call_of(settings: Mapping[str, Any], history: int) -> str:
     given += [f"{name}={value}" for name, value in plain.items()]
     seen = settings.get("student_obs")
     if seen is not None:
-        given.append(f"student_obs={seen!r}" if not isinstance(seen, str) else f"...  # {seen}")
+        given.append(f"student_obs={'student_obs' if 'student_obs' in lost else repr(seen)}")
     if settings.get("keep") not in (None, "all"):
         given.append(f"keep={settings['keep']!r}")
     if settings.get("spread"):
@@ -116,11 +116,13 @@ def _environment(settings: Mapping[str, Any]) -> str | None:
 def _in_no_file(settings: Mapping[str, Any]) -> dict[str, str]:
     """Return the arguments that a reader has to make again, by name, with what they were."""
     expert, env, data = settings["expert"], _environment(settings), settings.get("dataset")
+    seen = settings.get("student_obs")
     is_address = is_http_url(expert) or is_hub_uri(expert)
     found = {
         "expert": None if settings.get("expert_sha256") or is_address else expert,
         "env": _environment_in_words(env, settings.get("made")),
         "dataset": data and f"sha256 {data}",
+        "student_obs": seen if isinstance(seen, str) else None,  # a function
     }
     return {name: said for name, said in found.items() if said is not None}
 

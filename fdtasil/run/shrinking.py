@@ -173,7 +173,8 @@ def shrink(
     """Find the smallest student that keeps a share of the expert's return.
 
     Nothing is recorded again: each student learns from the demonstrations of a run, and from the
-    answers that are stored with them; where the run asked a cheap expert anew, so do these. The
+    answers that are stored with them; where the run asked a cheap expert anew, so do these. A run
+    without probes has no answers: the expert is asked for each student, as `distill` does. The
     smallest is judged once more, from starts that it was not chosen by. Those that are cloned
     take as many steps as those with probes.
 

@@ -35,9 +35,10 @@ def json_file(path: Path | None) -> Path | None:
 
 
 def say(found: Found, file: Path | None) -> None:
-    """Print what was found; write it, where there is a file from `json_file`."""
-    print(found)
-    if file is not None:
+    """Write what was found, where there is a file from `json_file`, and print it."""
+    if file is not None:  # first: who reads the print may stop to
         plain, _ = without_infinities(found.to_json())
         write_bytes(file, json.dumps(plain, indent=2).encode())
+    print(found)
+    if file is not None:
         print(f"written: {file.name}")
