@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 
 import fdtasil
+from fdtasil.errors import FdtasilWarning
 from fdtasil.results.pair import _interval
 
 pytestmark = pytest.mark.usefixtures("no_pictures")
@@ -64,6 +65,29 @@ def test_few_pairs_some_without_a_return_have_no_interval(ours):
     assert found.normalized_return == pytest.approx(sum(ours) / 2)
     assert found.ci95 is None
     assert "95 % n/a" in str(found)
+
+
+def test_zero_is_random_actions_unless_most_of_the_experts_returns_are_positive():
+    """Random actions earn what the expert and the policy do, half of the time each."""
+    theirs, ours = np.array([0.0, 0.0, 0.0, 9.0]), np.full(4, -1.0)
+    found = judged(theirs, ours)
+    assert found.reference_return != 0
+    assert -1 < found.reference_return < 2.25
+    assert judged(np.array([0.0, 1.0, 1.0, 9.0]), ours).reference_return == 0
+    with pytest.warns(FdtasilWarning, match="return 0 is not above 0, that of random actions"):
+        nothing = judged(np.zeros(4), np.zeros(4))
+    assert nothing.normalized_return is nothing.ci95 is None
+
+
+def test_the_interval_of_a_task_of_costs_is_that_of_the_gain_over_random_actions():
+    """Which cost 2 about, where the expert's cost 1 and the policy's 3."""
+    apart = 0.1 * np.cos(np.arange(20))
+    found = judged(apart - 1, apart[::-1] - 3)
+    low, high = found.ci95
+    assert low < found.normalized_return < high < 0
+    assert found.normalized_return == pytest.approx(
+        (-3 - found.reference_return) / (-1 - found.reference_return), rel=0.1
+    )
 
 
 @pytest.mark.fault(273)

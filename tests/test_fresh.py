@@ -19,6 +19,7 @@ from fdtasil.probes.calibration import calibrate
 from fdtasil.probes.device_twin import DeviceTwin
 from fdtasil.probes.scales import measure_scales
 from fdtasil.probes.source import Probes
+from fdtasil.probes.spread import Spread, stands_still
 from fdtasil.probes.surroundings import Surroundings
 from fdtasil.run.presets import PRESETS
 from fdtasil.seeding import episode_seeds
@@ -226,6 +227,19 @@ def test_one_demonstration_teaches_every_command(spread):
     assert (said["bounds"] if spread == "bounds" else said) == {"4": pytest.approx(0.58, abs=0.01)}
     assert not result.report["warnings"]
     assert result.evaluation.normalized_return > 0.9
+
+
+def test_bounds_are_of_coordinates_that_stand_still_within_an_episode():
+    """A place that moves; commands, of which one varies a little and one is free; a constant."""
+    episode = np.repeat(np.arange(4), 50)
+    states = np.random.default_rng(0).standard_normal((200, 5))
+    states[:, 1] = np.array([-1.0, 0.2, 0.5, 3.0])[episode]
+    states[:, 2] = 1e-4 * states[:, 2] + episode
+    states[:, 3], states[:, 4] = episode, 7
+    low, high = np.array([[-6, -6, -12, -np.inf, 7], [6, 6, 12, np.inf, 7]])
+    told = Spread.of("bounds", low, high, 5).among(states, episode)
+    assert told == pytest.approx({1: 12 / 12**0.5, 2: 24 / 12**0.5})
+    assert stands_still(states, episode).tolist() == [False, True, True, True, False]
 
 
 @pytest.mark.fault(204)

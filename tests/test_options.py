@@ -38,6 +38,21 @@ def test_the_best_weights_are_those_of_the_best_validation():
     assert float(student.weight) == 2.0
 
 
+def test_an_entry_is_the_mean_of_the_steps_since_the_last_one():
+    student = torch.nn.Linear(1, 1, device="meta").to_empty(device="cpu")
+    for weights in student.parameters():
+        torch.nn.init.zeros_(weights)
+    state = FitState(student, torch.optim.AdamW(student.parameters()))
+    entries = []
+    for losses in ((1.0, 3.0), (5.0,)):
+        for loss in losses:
+            state.count(torch.full((len(TaylorLoss._fields),), loss))
+        entries.append(state.log(None))
+    assert [entry["step"] for entry in entries] == [2, 3]
+    assert [entry["loss"] for entry in entries] == [2.0, 5.0]
+    assert [entry["validation_loss"] for entry in entries] == [2.0, 5.0]
+
+
 def test_patience_stops_early(linear):
     held = Fit(steps=5000, validation=0.5, patience=2, learning_rate=1e-30)
     result = fdtasil.distill(linear, TOY, 0, **{**QUICK, "episodes": 4, "fit": held})

@@ -30,7 +30,7 @@ def off_by(error):
     return lambda rows: (rows @ GAIN.T + error).astype(np.float32)
 
 
-def decide(trainer, round_, student, rows=ROWS):
+def decide(trainer, round_, student, rows=ROWS, chooses=False):
     with EnvironmentPool(TOY) as pool:
         expert = load_expert(linear, 5, 2)
 
@@ -38,7 +38,8 @@ def decide(trainer, round_, student, rows=ROWS):
             noise = [np.random.default_rng(e) for e in range(count)]
             return rollout(behaviour, pool, range(count), 20, noise)
 
-        behaviour = trainer.behaviour(Situation(round_, expert, HALF, student, record))
+        situation = Situation(round_, expert, HALF, student, record, chooses)
+        behaviour = trainer.behaviour(situation)
         asked = dict(expert.queries)
         decision = behaviour(rows, [np.random.default_rng(e) for e in range(len(rows))])
     return decision, asked
@@ -107,6 +108,12 @@ def test_dagger_switches():
     theirs = np.isclose(decision.action, linear(ROWS), atol=1e-6).all(axis=1)
     assert (own | theirs).all()
     assert theirs.mean() == pytest.approx(0.3, abs=0.07)
+
+
+def test_dagger_takes_the_choice_of_one_of_both():
+    """The mean of two scores is the best of nobody."""
+    decision, _ = decide(DAgger(), 1, off_by(1), chooses=True)
+    assert set(np.round(decision.action - linear(ROWS), 5).flat) == {0, 1}
 
 
 def test_a_student_alone_is_labelled_afterwards():

@@ -150,6 +150,14 @@ def test_dust_is_no_movement():
     assert scales.scale[2] == 1.0
 
 
+def test_what_moves_in_float32_is_live_beside_any_offset_and_unit():
+    """Three hundredths of a kelvin at 300; of a second at a million, they are rounding."""
+    states = np.random.default_rng(0).standard_normal((100, 4)) * [1.0, 2.0, 0.03, 0.03]
+    scales = measure_scales(states * [1e12, 1, 1, 1] + [0, 0, 300, 1e6])
+    assert scales.live.tolist() == [True, True, True, False]
+    assert scales.units[2:] == pytest.approx([states[:, 2].std(), 1.0])
+
+
 @pytest.mark.fault(231)
 def test_bounds_as_large_as_float32_are_none():
     largest = float(np.finfo(np.float32).max)
