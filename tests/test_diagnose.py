@@ -16,7 +16,7 @@ from fdtasil.errors import ExpertError, SettingError
 from fdtasil.experts.load import load_expert
 from fdtasil.probes.scales import measure_scales
 from fdtasil.results.fidelity import fidelity_of
-from fdtasil.results.stability import Law, Stability, _interval, stability_of
+from fdtasil.results.stability import Law, Stability, _interval, distances, stability_of
 from fdtasil.rollouts.behaviours import follow
 from fdtasil.rollouts.environments import EnvironmentPool
 from fdtasil.rollouts.rollout import rollout
@@ -24,6 +24,7 @@ from fdtasil.shell.gains import command as gains_command
 
 STIFFNESS = 0.2
 SIZES = (1e-3, 3e-3, 1e-2, 3e-2)
+SIDES = np.array([[-1.0], [1.0]])  # states of deviation 1
 
 
 class PowerLaw(gymnasium.Env):
@@ -53,7 +54,7 @@ def measured(nu, sizes, horizon, system=PowerLaw, episodes=6, unit=1.0):
     with EnvironmentPool(lambda: system(nu)) as pool:
         expert = load_expert(rest, 1, 1)
         own = rollout(follow(expert.policy("act")), pool, range(episodes), horizon)
-        scales, seeds = measure_scales(np.array([[-1.0], [1.0]])), range(episodes)
+        scales, seeds = measure_scales(SIDES), range(episodes)
         units = np.full(1, unit)
         return stability_of(expert, own, pool, horizon, units, scales, seeds, sizes)
 
@@ -85,6 +86,16 @@ def test_a_disturbance_is_measured_in_units_of_the_actions():
     found = measured(1.0, SIZES, 60, unit=0.1)
     assert found.sizes == pytest.approx(SIZES, rel=1e-3)
     assert found.law.constant == pytest.approx(0.1 / STIFFNESS, rel=0.01)
+
+
+def test_two_paths_are_apart_while_both_last():
+    with EnvironmentPool(lambda: PowerLaw(1.0)) as pool:
+        own = rollout(follow(rest), pool, range(3), 20)
+    valid = np.arange(20) < np.array([[5], [12], [20]])
+    beside = np.where(valid[..., None], own.observations + 0.1, 0)
+    other, scales = replace(own, valid=valid, observations=beside), measure_scales(SIDES)
+    for pair in ((own, other), (other, own)):
+        assert distances(*pair, scales) == pytest.approx(0.1 / scales.deviation[0], rel=1e-4)
 
 
 def test_fewer_than_five_episodes_have_no_interval():
@@ -223,6 +234,16 @@ def test_the_error_of_a_student_without_an_experts_noise_is_the_experts_roughnes
     found = fidelity_of(linear(GAIN), noisy, states, UNITS, scales, np.random.default_rng(0))
     assert found.errors == pytest.approx(found.roughness, rel=0.05)
     assert found.errors[0] > 0.9 > 0.3 > found.errors[-1]
+
+
+def test_an_action_that_hardly_varies_is_measured_by_its_range():
+    states = np.random.default_rng(0).standard_normal((200, 5)).astype(np.float32)
+    scales, random = measure_scales(states), np.random.default_rng(0)
+    still, nearly = GAIN * np.float32([[1], [1e-8]]), GAIN * np.float32([[1], [1e-3]])
+    found = fidelity_of(linear(nearly), linear(still), states, UNITS, scales, random)
+    assert 0 < found.error < 0.01
+    nothing = fidelity_of(linear(GAIN), linear(1e-8 * GAIN), states, UNITS, scales, random)
+    assert np.isnan(nothing.errors).all()
 
 
 def test_coordinates_that_are_held_are_no_part_of_fidelity():

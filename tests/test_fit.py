@@ -14,7 +14,7 @@ from fdtasil.probes.answers import Answers
 from fdtasil.probes.scales import measure_scales
 from fdtasil.run.presets import preset_of
 from fdtasil.student.batches import Batches
-from fdtasil.student.fit import Fit, Hooks, fit
+from fdtasil.student.fit import Fit, Hooks, fit, hold_out
 
 
 def train(spec=None, student=None, **changes):
@@ -82,6 +82,15 @@ def test_every_epoch_visits_each_state_once_and_every_probe_comes_up(spec, epoch
     assert np.array_equal(stored[np.lexsort(stored.T)], used[np.lexsort(used.T)])
 
 
+def test_a_minibatch_mixes_the_directions():
+    """Each state begins with another one: a basis is not gone through one by one by all."""
+    demonstrations, probes, ask = linear_task(states=50, spec="basis")
+    batches = Batches(demonstrations, probes, ask, stream, torch.device("cpu"))
+    for batch in batches.epoch(0, torch.arange(50), 2):
+        moved = (batch.probes.displacements[:, 0] != 0).sum(dim=0)
+        assert 0 < moved.min() <= moved.max() < 15
+
+
 def test_every_epoch_has_an_order_and_minibatches_of_its_own():
     """A gradient over neighbours in time, or over the same states again, is less than a sample."""
     demonstrations, _, _ = linear_task(states=50)
@@ -134,6 +143,37 @@ def test_an_epoch_visits_the_states_that_are_not_held_out():
     settings = Fit(epochs=3, validation=0.5)
     fit(new_student(), demonstrations, None, None, settings, stream, hooks=hooks)
     assert (steps, epochs) == ([3], [1, 2])
+
+
+def test_the_weights_of_the_best_validation_are_left():
+    """Labels of noise are learnt by heart: what is held out tells so."""
+    random = np.random.default_rng(0)
+    noise, episode = random.standard_normal((40, 2)), np.repeat(np.arange(4), 10)
+    demonstrations = replace(
+        linear_task(states=40)[0], actions=noise.astype(np.float32), episode=episode
+    )
+    settings, student = Fit(300, batch_size=7, learning_rate=0.01, validation=0.25), new_student()
+    history = fit(student, demonstrations, None, None, settings, stream)
+    losses = [entry["validation_loss"] for entry in history]
+    assert min(losses) < losses[-1]
+    _, held = hold_out(demonstrations, settings, stream("held out"))
+    apart = student.act(demonstrations.observations[held]) - noise[held]
+    found = np.linalg.norm(apart / student.action_units.numpy(), axis=1).mean()
+    assert found == pytest.approx(min(losses), rel=1e-4)
+
+
+@pytest.mark.parametrize(("spec", "expected"), [("3", 4000), ("3,resample", 12_000)])
+def test_what_is_asked_anew_is_trained_on_for_longer(spec, expected):
+    class Begun(Exception):
+        pass
+
+    def begin(steps):
+        raise Begun(steps)
+
+    demonstrations, probes, ask = linear_task(spec=spec)
+    with pytest.raises(Begun) as told:
+        fit(new_student(), demonstrations, probes, ask, Fit(), stream, hooks=Hooks(begin=begin))
+    assert told.value.args == (expected,)
 
 
 @pytest.mark.fault(100)

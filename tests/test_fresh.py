@@ -230,16 +230,17 @@ def test_one_demonstration_teaches_every_command(spread):
 
 
 def test_bounds_are_of_coordinates_that_stand_still_within_an_episode():
-    """A place that moves; commands, of which one varies a little and one is free; a constant."""
+    """A place; commands, one of which hardly varies; without ends; a constant; drifts."""
     episode = np.repeat(np.arange(4), 50)
-    states = np.random.default_rng(0).standard_normal((200, 5))
+    states = np.random.default_rng(0).standard_normal((200, 7))
     states[:, 1] = np.array([-1.0, 0.2, 0.5, 3.0])[episode]
     states[:, 2] = 1e-4 * states[:, 2] + episode
-    states[:, 3], states[:, 4] = episode, 7
-    low, high = np.array([[-6, -6, -12, -np.inf, 7], [6, 6, 12, np.inf, 7]])
-    told = Spread.of("bounds", low, high, 5).among(states, episode)
+    states[:, 3], states[:, 4], states[:, 5] = episode, 7, 0.015 * states[:, 5] + episode
+    states[50:, 6] = episode[50:]
+    low, high = np.array([[-6, -6, -12, -np.inf, 7, 0, -9], [6, 6, 12, np.inf, 7, 3, 9]])
+    told = Spread.of("bounds", low, high, 7).among(states, episode)
     assert told == pytest.approx({1: 12 / 12**0.5, 2: 24 / 12**0.5})
-    assert stands_still(states, episode).tolist() == [False, True, True, True, False]
+    assert stands_still(states, episode).tolist() == [False, True, True, True, *[False] * 3]
 
 
 @pytest.mark.fault(204)

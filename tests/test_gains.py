@@ -62,6 +62,16 @@ def test_the_noise_floor_is_the_noise():
     assert found.noise_floor == pytest.approx(np.full(M, 1e-2), rel=0.4)
 
 
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_the_error_of_a_law_that_bends_nowhere_is_that_of_its_noise(seed):
+    gain = np.random.default_rng(2).standard_normal((M, N)).astype(np.float32)
+    random = np.random.default_rng(seed)
+    law = lambda rows: rows @ gain.T + 0.01 * random.standard_normal((len(rows), M))  # noqa: E731
+    found = gains(law, STATES / SCALE, seed=seed)
+    apart = np.linalg.norm(np.sqrt(((found.jacobian - gain) ** 2).mean(axis=0)) * found.scale)
+    assert 0.75 < np.linalg.norm(found.error * found.scale) / apart < 1.35
+
+
 def test_a_linear_expert_is_exact_and_a_single_state_is_enough():
     gain = np.random.default_rng(2).standard_normal((2, 4)).astype(np.float32)
     found = gains(lambda rows: rows @ gain.T, np.zeros((1, 4)))
@@ -153,6 +163,8 @@ def test_derivatives_of_something_else_are_named():
         fdtasil.distill(
             lambda rows: (sensitive(rows)[0], np.tile(sensitive(rows)[1], (1, 2, 1))), TOY, **run
         )
+    with pytest.raises(ExpertError, match="gives derivatives that are not finite"):
+        fdtasil.distill(lambda rows: sensitive(rows, sign=np.nan), TOY, **run)
     with pytest.raises(ExpertError, match="differentiated twice"):
         fdtasil.distill(sensitive, TOY, **{**run, "fit": fdtasil.Fit(steps=40, order=2)})
 

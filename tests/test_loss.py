@@ -136,6 +136,15 @@ def test_labels_are_the_action_error_at_the_moved_states(states):
     assert float(loss.loss) == pytest.approx(float(loss.action_error + error), rel=1e-4)
 
 
+@pytest.mark.parametrize("spec", ["sphere:1,labels", "sphere:5,labels", "sphere:3,central,labels"])
+def test_a_label_weighs_the_same_for_every_number_of_them(states, spec):
+    expert = smooth_expert()
+    batch, stencil = batch_of(expert, spec, states)
+    loss = taylor_loss(lambda x: expert(x).detach() + 1, batch, stencil, Fit().weights("labels"))
+    assert float(loss.moved_error) == pytest.approx(3**0.5, rel=1e-4)
+    assert float(loss.loss) == pytest.approx(2 * 3**0.5, rel=1e-4)
+
+
 def test_both_are_the_sum_of_labels_and_differences(states):
     """Each difference is measured in units of its own distance."""
     expert, student = smooth_expert(), weaker_expert()

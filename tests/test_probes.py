@@ -41,6 +41,7 @@ def test_half_the_adaptive_directions_are_excursions_where_observations_are_redu
 def test_few_states_say_nothing_of_redundant_directions():
     """As many coordinates as states: what looks like few directions is few states."""
     assert not is_redundant(states(20, physical=3)[:20])
+    assert not is_redundant(np.ones((30, 20)))
     assert is_redundant(states(20, physical=3))
 
 
@@ -119,6 +120,7 @@ def test_the_mean_square_is_the_jacobians_where_parts_move_alone(design, spread)
     squares = ((drawn.gains[drawn.numbers][..., None] * moved) ** 2).sum(axis=-1)
     whole = ((jacobian * scales.deviation) ** 2).sum()
     assert squares.mean() == pytest.approx(whole, rel=0.05)
+    assert drawn.displacements.any(axis=1).all()
 
 
 @pytest.mark.fault(85)
@@ -138,9 +140,19 @@ def test_few_states_share_no_direction():
 
 def test_frames_prefer_no_side():
     """A forward difference tells one side of a kink: half of them must lie on each."""
-    bank, _ = OrthogonalFrames(3).around(states(3))(2000, np.random.default_rng(0))
+    bank, numbers = OrthogonalFrames(2).around(states(3))(9000, np.random.default_rng(0))
     above = (bank.reshape(-1, 3, 3) > 0).mean(axis=0)
     assert above == pytest.approx(np.full((3, 3), 0.5), abs=0.06)
+    assert len(np.unique(numbers)) > 0.95 * len(bank)
+
+
+def test_states_have_directions_of_their_own_where_answers_are_kept():
+    """Of those that are asked anew in a moment, some share them: drawing takes time."""
+    rows = states(4).astype(np.float32)
+    for spec, least in (("sphere:10", 2000), ("sphere:10,resample", 1000)):
+        probes = PRESETS["standard"].complete(Probes.parse(f"{spec},radius=1")).with_order(1)
+        drawn = Surroundings.of(rows, probes, measure_scales(rows))
+        assert len(np.unique(drawn.sample(np.random.default_rng(0)).numbers)) >= least
 
 
 @pytest.mark.parametrize("design", [RandomSphere(5000), OrthogonalFrames(8)])

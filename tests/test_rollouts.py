@@ -38,6 +38,7 @@ def test_shapes_masks_and_ends():
         assert (length < 30) == episodes.terminated[e]
         assert not episodes.observations[e, length:].any()
         assert not episodes.rewards[e, length:].any()
+    assert (episodes.spread(300)[:, 4] == 3).all()  # the constant, of visited states alone
 
 
 def test_an_episode_does_not_depend_on_those_beside_it():
@@ -205,5 +206,6 @@ def test_random_actions_are_uniform_between_bounds_and_normal_without():
 
 def test_answers_are_compared_where_both_are_some():
     ours, theirs = np.array([[np.nan, 1, 2, 9], [0, np.nan, 5, 9]])[..., None]
+    ours, theirs = (np.pad(one, [(0, 0), (0, 1)]) for one in (ours, theirs))  # and a whole action
     assert farthest_apart(ours, theirs) == 3
     assert farthest_apart(ours[:2], theirs[:2]) == 0

@@ -119,6 +119,8 @@ def test_dagger_takes_the_choice_of_one_of_both():
 def test_a_student_alone_is_labelled_afterwards():
     decision, _ = decide(DAgger(beta=0.0), 1, off_by(1))
     assert decision.expert_action is None
+    never = DAgger(updates=(1,), beta=lambda round_: 0.0)  # but there is no student at first
+    assert never.queries(3, 10) == {"act": 10, "label": 20}
     result = fdtasil.distill(linear, TOY, 0, trainer=DAgger(beta=0.0), **{**QUICK, "episodes": 3})
     assert result.queries["act"] == 20
     assert result.queries["label"] == 40
@@ -196,3 +198,11 @@ def test_wrong_settings_are_refused(wrong):
 def test_one_episode_is_one_round(trainer, linear):
     with pytest.warns(FdtasilWarning, match="leave trainer="):
         fdtasil.distill(linear, TOY, 0, trainer=trainer, **{**QUICK, "episodes": 1})
+
+
+@pytest.mark.filterwarnings("ignore:.*leaves the action bounds")
+def test_what_happened_is_counted_over_all_rounds():
+    """The expert acts in each of three, at twice what the environment takes."""
+    run = {**QUICK, "episodes": 3, "trainer": DAgger(updates=(1, 2), beta=1.0), "force": True}
+    result = fdtasil.distill(lambda rows: -2 * np.sign(rows[:, :2]), TOY, 0, **run)
+    assert result.report["clipped_actions"] == len(result.demonstrations) == 60
