@@ -131,6 +131,16 @@ def test_several_choices(tmp_path):
     assert np.array_equal(session.run(["actions"], {"obs": rows})[0], chosen)
 
 
+def test_choices_agree_where_all_of_them_do():
+    half, expert = (
+        in_form(lambda x, sides=sides: law(x) * sides, "box", "choices")
+        for sides in ([1, -1], [1, 1])
+    )
+    made, run = lambda: InForm("box", "choices"), {"episodes": 2, "horizon": 20}
+    assert fdtasil.evaluate(half, expert, made, **run).agreement == 0
+    assert fdtasil.evaluate(expert, expert, made, **run).agreement == 1
+
+
 @pytest.mark.fault(218)
 @pytest.mark.parametrize("trainer", ["dart", "noise"])
 def test_noise_on_choices_is_refused(trainer):

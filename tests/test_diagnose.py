@@ -1,6 +1,7 @@
 """Diagnostics on systems whose answers are known."""
 
 import json
+from dataclasses import replace
 
 import gymnasium
 import numpy as np
@@ -15,7 +16,7 @@ from fdtasil.errors import ExpertError, SettingError
 from fdtasil.experts.load import load_expert
 from fdtasil.probes.scales import measure_scales
 from fdtasil.results.fidelity import fidelity_of
-from fdtasil.results.stability import Law, stability_of
+from fdtasil.results.stability import Law, Stability, _interval, distances, stability_of
 from fdtasil.rollouts.behaviours import follow
 from fdtasil.rollouts.environments import EnvironmentPool
 from fdtasil.rollouts.rollout import rollout
@@ -23,6 +24,7 @@ from fdtasil.shell.gains import command as gains_command
 
 STIFFNESS = 0.2
 SIZES = (1e-3, 3e-3, 1e-2, 3e-2)
+SIDES = np.array([[-1.0], [1.0]])  # states of deviation 1
 
 
 class PowerLaw(gymnasium.Env):
@@ -47,13 +49,14 @@ def rest(rows):
     return np.zeros((len(rows), 1), np.float32)
 
 
-def measured(nu, sizes, horizon, system=PowerLaw):
+def measured(nu, sizes, horizon, system=PowerLaw, episodes=6, unit=1.0):
     """In units of the state itself."""
     with EnvironmentPool(lambda: system(nu)) as pool:
         expert = load_expert(rest, 1, 1)
-        own = rollout(follow(expert.policy("act")), pool, range(6), horizon)
-        scales = measure_scales(np.array([[-1.0], [1.0]]))
-        return stability_of(expert, own, pool, horizon, np.ones(1), scales, range(6), sizes)
+        own = rollout(follow(expert.policy("act")), pool, range(episodes), horizon)
+        scales, seeds = measure_scales(SIDES), range(episodes)
+        units = np.full(1, unit)
+        return stability_of(expert, own, pool, horizon, units, scales, seeds, sizes)
 
 
 def test_a_loop_that_forgives_in_proportion():
@@ -70,6 +73,42 @@ def test_a_loop_that_forgives_in_proportion():
     assert found.rate == pytest.approx(1 - STIFFNESS, rel=1e-3)
     assert found.rate_interval == pytest.approx((found.rate,) * 2, rel=1e-3)
     assert law.reach == pytest.approx((1e-3, 3e-2), rel=1e-4)
+
+
+def test_a_law_is_of_four_sizes_between_rounding_and_a_third_of_a_deviation():
+    """The first leads to half of what float32 leaves of a path, and the last to a half."""
+    sizes = (1e-6, 3e-6, 1e-5, 1e-4, 1e-3, 3e-2, 0.1)
+    assert measured(1.0, sizes, 60).law.reach == pytest.approx((3e-6, 3e-2), rel=0.01)
+    assert measured(1.0, SIZES[:3], 60).law is None
+
+
+def test_a_disturbance_is_measured_in_units_of_the_actions():
+    found = measured(1.0, SIZES, 60, unit=0.1)
+    assert found.sizes == pytest.approx(SIZES, rel=1e-3)
+    assert found.law.constant == pytest.approx(0.1 / STIFFNESS, rel=0.01)
+
+
+def test_two_paths_are_apart_while_both_last():
+    with EnvironmentPool(lambda: PowerLaw(1.0)) as pool:
+        own = rollout(follow(rest), pool, range(3), 20)
+    valid = np.arange(20) < np.array([[5], [12], [20]])
+    beside = np.where(valid[..., None], own.observations + 0.1, 0)
+    other, scales = replace(own, valid=valid, observations=beside), measure_scales(SIDES)
+    for pair in ((own, other), (other, own)):
+        assert distances(*pair, scales) == pytest.approx(0.1 / scales.deviation[0], rel=1e-4)
+
+
+def test_fewer_than_five_episodes_have_no_interval():
+    four, five = (measured(1.0, SIZES, 40, episodes=count) for count in (4, 5))
+    assert four.law.interval is four.rate_interval is None
+    assert four.rate == pytest.approx(five.rate, rel=1e-3)
+    assert None not in (five.law.interval, five.rate_interval)
+
+
+def test_an_interval_over_episodes_holds_the_mean_95_times_of_100():
+    random = np.random.default_rng(0)
+    found = np.array([_interval(random.normal(1, 2, 6)) for _ in range(2000)])
+    assert ((found[:, 0] < 1) & (found[:, 1] > 1)).mean() == pytest.approx(0.95, abs=0.012)
 
 
 @pytest.mark.fault(226)
@@ -138,6 +177,23 @@ def test_orders_of_an_interval(interval, said):
     assert str(law).endswith(f"order that the theorems ask for: {said}")
 
 
+@pytest.mark.parametrize(
+    ("exponent", "order"),
+    [(1.06, 0), (1.04, 1), (0.51, 1), (0.5, 2), (0.34, 2), (0.26, 3), (0.101, 9), (0.1, None)],
+)
+def test_the_order_is_the_least_that_has_a_theorem(exponent, order):
+    """Theorem 3.2 holds for p >= 1 and nu > 1 / (p + 1), 3.1 for nu > 1, measured surely."""
+    law = Law(2.0, exponent, (1e-3, 0.1), (1.0, 2.0), None, settled=True)
+    assert law.order == order
+    assert replace(law, settled=False).order is None
+
+
+def test_what_is_reached_is_of_all_sizes_up_to_the_next_larger_one():
+    found = Stability((1e-3, 1e-2, 1e-1), (0.2, 0.1, 0.4), (0, 0, 0), None)
+    assert [found.reached(size) for size in (1e-4, 5e-3, 1e-2, 2e-2)] == [0.2, 0.2, 0.2, 0.4]
+    assert found.reached(0.2) is None
+
+
 UNITS = np.ones(2)
 
 
@@ -158,6 +214,46 @@ def test_fidelity_of_known_laws():
     noisy = lambda rows: linear(GAIN)(rows) + 0.01 * np.sin(1e5 * rows[:, :2])  # noqa: E731
     rough = fidelity_of(linear(GAIN), noisy, states, UNITS, scales, random).roughness
     assert rough[0] > 10 * max(found.roughness)
+
+
+def test_a_radius_of_fidelity_is_in_deviations_of_each_coordinate():
+    """A student that adds a parabola of four coordinates is off by sqrt(1 + radius^2)."""
+    deviations = np.array([1.0, 20.0, 0.3, 5.0])
+    states = np.random.default_rng(0).standard_normal((2000, 4)) * deviations
+    plane = lambda rows: (rows / deviations).sum(axis=1, keepdims=True)  # noqa: E731
+    bent = lambda rows: plane(rows) + ((rows / deviations) ** 2).sum(axis=1)[:, None] / 2  # noqa: E731
+    scales, random = measure_scales(states), np.random.default_rng(1)
+    found = fidelity_of(bent, plane, states.astype(np.float32), np.ones(1), scales, random)
+    assert found.errors == pytest.approx(np.sqrt(1 + np.square(found.radii)), rel=0.03)
+
+
+def test_the_error_of_a_student_without_an_experts_noise_is_the_experts_roughness():
+    states = np.random.default_rng(0).standard_normal((1000, 5)).astype(np.float32)
+    random, scales = np.random.default_rng(1), measure_scales(states)
+    noisy = lambda rows: linear(GAIN)(rows) + random.normal(0, 0.05, (len(rows), 2))  # noqa: E731
+    found = fidelity_of(linear(GAIN), noisy, states, UNITS, scales, np.random.default_rng(0))
+    assert found.errors == pytest.approx(found.roughness, rel=0.05)
+    assert found.errors[0] > 0.9 > 0.3 > found.errors[-1]
+
+
+def test_an_action_that_hardly_varies_is_measured_by_its_range():
+    states = np.random.default_rng(0).standard_normal((200, 5)).astype(np.float32)
+    scales, random = measure_scales(states), np.random.default_rng(0)
+    still, nearly = GAIN * np.float32([[1], [1e-8]]), GAIN * np.float32([[1], [1e-3]])
+    found = fidelity_of(linear(nearly), linear(still), states, UNITS, scales, random)
+    assert 0 < found.error < 0.01
+    nothing = fidelity_of(linear(GAIN), linear(1e-8 * GAIN), states, UNITS, scales, random)
+    assert np.isnan(nothing.errors).all()
+
+
+def test_coordinates_that_are_held_are_no_part_of_fidelity():
+    states = np.random.default_rng(0).standard_normal((200, 5)).astype(np.float32)
+    scales, other = measure_scales(states), GAIN.copy()
+    other[:, 1] += 1
+    for held in ((), (1,)):
+        random = np.random.default_rng(0)
+        found = fidelity_of(linear(other), linear(GAIN), states, UNITS, scales, random, held)
+        assert (found.error < 1e-3) == (held == (1,))
 
 
 @pytest.mark.parametrize("factor", [0.97, 1.02])

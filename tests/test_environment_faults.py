@@ -445,6 +445,14 @@ def test_a_student_that_breaks_the_physics_has_no_normalised_return():
     assert found.normalized_return is None
     assert found.ci95 is None
 
+    def half(rows):
+        return backwards(rows) * (np.arange(len(rows)) % 2)[:, None]
+
+    with pytest.warns(FdtasilWarning, match="reset itself in 2 of 4 episodes"):
+        found = fdtasil.evaluate(half, run_forward, environment, episodes=4, horizon=20)
+    assert found.physics_resets == 2
+    assert found.normalized_return is not None
+
 
 @pytest.mark.fault(81)
 @pytest.mark.filterwarnings("ignore::fdtasil.errors.FdtasilWarning")

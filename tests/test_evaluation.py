@@ -1,12 +1,15 @@
 """What an evaluation says of a few numbers that are known."""
 
 import warnings
+from dataclasses import replace
 
 import gymnasium
 import numpy as np
 import pytest
+from toy_environments import Integrator
 
 import fdtasil
+from fdtasil.errors import FdtasilWarning
 from fdtasil.results.pair import _interval
 
 pytestmark = pytest.mark.usefixtures("no_pictures")
@@ -66,6 +69,45 @@ def test_few_pairs_some_without_a_return_have_no_interval(ours):
     assert "95 % n/a" in str(found)
 
 
+def test_a_single_pair_has_no_interval():
+    found = judged(np.array([2.0]), np.array([1.0]))
+    assert (found.normalized_return, found.ci95) == (0.5, None)
+
+
+def test_what_went_wrong_is_said_of_whom():
+    found = judged(np.array([2.0, 1.0]), np.array([1.0, 1.0]))
+    found = replace(found, violations=(("fast", 0.25, 0.5),), given_up=1, expert_given_up=2)
+    assert "fast              violated at 25.00% of the expert's steps, 50.00% of" in str(found)
+    assert "         2   episodes, for the expert had" in str(found)
+    assert "         1   episodes, for the student had" in str(found)
+    html = found._repr_html_()
+    assert "50.00% of the steps, the expert 25.00%" in html
+    assert "1 episodes, for the student had" in html
+
+
+def test_zero_is_random_actions_unless_most_of_the_experts_returns_are_positive():
+    """Random actions earn what the expert and the policy do, half of the time each."""
+    theirs, ours = np.array([0.0, 0.0, 0.0, 9.0]), np.full(4, -1.0)
+    found = judged(theirs, ours)
+    assert found.reference_return != 0
+    assert -1 < found.reference_return < 2.25
+    assert judged(np.array([0.0, 1.0, 1.0, 9.0]), ours).reference_return == 0
+    with pytest.warns(FdtasilWarning, match="return 0 is not above 0, that of random actions"):
+        nothing = judged(np.zeros(4), np.zeros(4))
+    assert nothing.normalized_return is nothing.ci95 is None
+
+
+def test_the_interval_of_a_task_of_costs_is_that_of_the_gain_over_random_actions():
+    """Which cost 2 about, where the expert's cost 1 and the policy's 3."""
+    apart = 0.1 * np.cos(np.arange(20))
+    found = judged(apart - 1, apart[::-1] - 3)
+    low, high = found.ci95
+    assert low < found.normalized_return < high < 0
+    assert found.normalized_return == pytest.approx(
+        (-3 - found.reference_return) / (-1 - found.reference_return), rel=0.1
+    )
+
+
 @pytest.mark.fault(273)
 def test_the_lower_end_is_seldom_above_the_truth_near_the_reference():
     """The expert is 0.6 deviations above it: some draws have none left to be a share of."""
@@ -79,3 +121,26 @@ def test_the_lower_end_is_seldom_above_the_truth_near_the_reference():
             above += found[0] > 0.5
     assert known > 100
     assert above < 0.08 * known
+
+
+def test_steps_after_the_end_count_for_nothing():
+    class Short(Integrator):
+        def reset(self, **named):
+            self.left = 10
+            return super().reset(**named)
+
+        def step(self, action):
+            self.left -= 1
+            observation, reward, _, cut, about = super().step(action)
+            return observation, reward, self.left == 0, cut, about
+
+    expert, policy = (lambda rows, k=k: (-k * rows[:, :2]).astype(np.float32) for k in (0.5, 0.3))
+    short, long = (
+        fdtasil.evaluate(policy, expert, Short, episodes=4, horizon=horizon)
+        for horizon in (10, 30)
+    )
+    numbers = ("student_returns", "expert_returns", "action_error", "imitation_gap", "roughness")
+    for name in numbers:
+        assert getattr(long, name) == pytest.approx(getattr(short, name)), name
+    assert long.survival == 0
+    assert long.imitation_gap > 0

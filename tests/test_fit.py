@@ -14,7 +14,7 @@ from fdtasil.probes.answers import Answers
 from fdtasil.probes.scales import measure_scales
 from fdtasil.run.presets import preset_of
 from fdtasil.student.batches import Batches
-from fdtasil.student.fit import Fit, Hooks, fit
+from fdtasil.student.fit import Fit, Hooks, fit, hold_out
 
 
 def train(spec=None, student=None, **changes):
@@ -63,21 +63,45 @@ def test_the_cost_of_a_step_does_not_grow_with_the_stored_probes():
     assert cost["50"] / cost[None] < 3
 
 
-def test_every_epoch_visits_each_state_once_and_every_probe_comes_up():
-    demonstrations, probes, ask = linear_task(states=50, spec="5")
+@pytest.mark.parametrize(("spec", "epochs"), [("5", 5), ("sphere:6,per_step=2", 3)])
+def test_every_epoch_visits_each_state_once_and_every_probe_comes_up(spec, epochs):
+    demonstrations, probes, ask = linear_task(states=50, spec=spec)
     answers = ask(0)
     batches = Batches(demonstrations, probes, ask, stream, torch.device("cpu"))
     seen = []
-    for epoch in range(5):
+    for epoch in range(epochs):
         dealt = list(batches.epoch(epoch, torch.arange(50), 4))
         states = torch.cat([batch.observations for batch in dealt]).numpy()
         assert np.array_equal(
             np.sort(states, axis=0), np.sort(demonstrations.observations, axis=0)
         )
-        seen.append(torch.cat([batch.probes.values[:, 0, 0] for batch in dealt]).numpy())
+        used = torch.cat([batch.probes.values[:, :, 0] for batch in dealt])
+        seen.append(used.flatten(0, 1).numpy())
     stored = answers.values[:, :, 0].reshape(-1, 2)
     used = np.concatenate(seen)
     assert np.array_equal(stored[np.lexsort(stored.T)], used[np.lexsort(used.T)])
+
+
+def test_a_minibatch_mixes_the_directions():
+    """Each state begins with another one: a basis is not gone through one by one by all."""
+    demonstrations, probes, ask = linear_task(states=50, spec="basis")
+    batches = Batches(demonstrations, probes, ask, stream, torch.device("cpu"))
+    for batch in batches.epoch(0, torch.arange(50), 2):
+        moved = (batch.probes.displacements[:, 0] != 0).sum(dim=0)
+        assert 0 < moved.min() <= moved.max() < 15
+
+
+def test_every_epoch_has_an_order_and_minibatches_of_its_own():
+    """A gradient over neighbours in time, or over the same states again, is less than a sample."""
+    demonstrations, _, _ = linear_task(states=50)
+    batches = Batches(demonstrations, None, None, stream, torch.device("cpu"))
+    given = {tuple(row): number for number, row in enumerate(demonstrations.observations)}
+    halves = []
+    for epoch in range(3):
+        first, _ = batches.epoch(epoch, torch.arange(50), 2)
+        halves.append(frozenset(given[tuple(row)] for row in first.observations.numpy()))
+    assert len(set(halves)) == 3
+    assert frozenset(range(25)) not in halves
 
 
 @pytest.mark.parametrize(("spec", "samples"), [("3", 1), ("3,resample", 4), ("3,per_step=2,resample", 7)])  # fmt: skip  # noqa: E501
@@ -109,6 +133,47 @@ def test_few_states_and_a_state_left_over(states, batches):
     dealt = Batches(demonstrations, None, None, stream, torch.device("cpu"))
     every = dealt.epoch(0, torch.arange(states), settings.schedule().steps_an_epoch(states))
     assert [len(batch.observations) for batch in every] == batches
+
+
+def test_an_epoch_visits_the_states_that_are_not_held_out():
+    """Two of four episodes, of fifty states each: one minibatch an epoch."""
+    demonstrations = replace(linear_task()[0], episode=np.repeat(np.arange(4), 50))
+    steps, epochs = [], []
+    hooks = Hooks(begin=steps.append, checkpoint=lambda state: epochs.append(state.step))
+    settings = Fit(epochs=3, validation=0.5)
+    fit(new_student(), demonstrations, None, None, settings, stream, hooks=hooks)
+    assert (steps, epochs) == ([3], [1, 2])
+
+
+def test_the_weights_of_the_best_validation_are_left():
+    """Labels of noise are learnt by heart: what is held out tells so."""
+    random = np.random.default_rng(0)
+    noise, episode = random.standard_normal((40, 2)), np.repeat(np.arange(4), 10)
+    demonstrations = replace(
+        linear_task(states=40)[0], actions=noise.astype(np.float32), episode=episode
+    )
+    settings, student = Fit(300, batch_size=7, learning_rate=0.01, validation=0.25), new_student()
+    history = fit(student, demonstrations, None, None, settings, stream)
+    losses = [entry["validation_loss"] for entry in history]
+    assert min(losses) < losses[-1]
+    _, held = hold_out(demonstrations, settings, stream("held out"))
+    apart = student.act(demonstrations.observations[held]) - noise[held]
+    found = np.linalg.norm(apart / student.action_units.numpy(), axis=1).mean()
+    assert found == pytest.approx(min(losses), rel=1e-4)
+
+
+@pytest.mark.parametrize(("spec", "expected"), [("3", 4000), ("3,resample", 12_000)])
+def test_what_is_asked_anew_is_trained_on_for_longer(spec, expected):
+    class Begun(Exception):
+        pass
+
+    def begin(steps):
+        raise Begun(steps)
+
+    demonstrations, probes, ask = linear_task(spec=spec)
+    with pytest.raises(Begun) as told:
+        fit(new_student(), demonstrations, probes, ask, Fit(), stream, hooks=Hooks(begin=begin))
+    assert told.value.args == (expected,)
 
 
 @pytest.mark.fault(100)
@@ -162,6 +227,24 @@ def test_steps_and_epochs_are_two_ways_to_say_one_thing():
         Fit(steps=1, epochs=1)
 
 
+def test_the_settings_of_adamw_reach_it():
+    """Ten steps of 0.001 at first, by a cosine: five and a half in all."""
+
+    def weights(student):
+        return torch.cat([p.detach().flatten() for p in student.parameters()])
+
+    def moved(**changes):
+        student, _ = train(steps=10, **changes)
+        return weights(student)
+
+    start, still = weights(new_student()), {"learning_rate": 1e-3, "weight_decay": 0}
+    assert float((moved(**still) - start).abs().max()) == pytest.approx(5.5e-3, rel=0.1)
+    for slow in ({"epsilon": 1e3}, {"max_gradient_norm": 1e-12}):
+        assert float((moved(**still, **slow) - start).abs().max()) < 1e-5
+    decayed = moved(learning_rate=1e-3, weight_decay=20, epsilon=1e3)
+    assert float(decayed.norm() / start.norm()) == pytest.approx(1 - 20 * 5.5e-3, rel=0.01)
+
+
 def test_a_preset_with_other_settings_keeps_the_rest():
     paper = preset_of("paper")
     assert paper.fit_with(steps=7) == replace(paper.fit, steps=7, epochs=None)
@@ -173,7 +256,16 @@ def test_a_preset_with_other_settings_keeps_the_rest():
 
 def test_much_data_is_trained_on_for_longer_unless_steps_are_given():
     assert [Fit().schedule().total_steps(n) for n in (1, 1500, 6000)] == [4000, 4000, 8000]
+    assert Fit().schedule().total_steps(2000) == 4600  # whole hundreds: of an entry each
     assert Fit(steps=7).schedule().total_steps(6000) == 7
+
+
+@pytest.mark.parametrize(
+    ("share", "episodes", "held"),
+    [(0, 9, 0), (0.3, 1, 0), (0.3, 10, 3), (0.01, 10, 1), (0.9, 2, 1), (0.95, 3, 2)],
+)
+def test_validation_holds_one_episode_out_at_least_and_leaves_one_to_learn(share, episodes, held):
+    assert Fit(validation=share).held_out(episodes) == held
 
 
 @pytest.mark.parametrize(
@@ -191,6 +283,18 @@ def test_answers_of_two_rounds_are_joined():
     assert isinstance(both, Answers)
     expected = [a.displacements[a.numbers] for a in (first, second)]
     assert np.array_equal(both.displacements[both.numbers], np.concatenate(expected))
+
+
+def test_a_later_round_with_more_probes_keeps_all_of_them():
+    """As a basis has, where a coordinate begins to move: the other states have some twice."""
+    two, three = (linear_task(states=5, spec=f"sphere:{count}")[2](0) for count in (2, 3))
+    for first, second in ((two, three), (three, two)):
+        both = first + second
+        for rows, one in ((np.arange(5), first), (np.arange(5, 10), second)):
+            columns = [0, 1, 0] if one is two else [0, 1, 2]
+            part, moved = both.at(rows), one.displacements[one.numbers]
+            assert np.array_equal(part.displacements[part.numbers], moved[:, columns])
+            assert np.array_equal(part.values, one.values[:, columns])
 
 
 def test_torch_settings_are_put_back():

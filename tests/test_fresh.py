@@ -19,6 +19,7 @@ from fdtasil.probes.calibration import calibrate
 from fdtasil.probes.device_twin import DeviceTwin
 from fdtasil.probes.scales import measure_scales
 from fdtasil.probes.source import Probes
+from fdtasil.probes.spread import Spread, stands_still
 from fdtasil.probes.surroundings import Surroundings
 from fdtasil.run.presets import PRESETS
 from fdtasil.seeding import episode_seeds
@@ -226,6 +227,20 @@ def test_one_demonstration_teaches_every_command(spread):
     assert (said["bounds"] if spread == "bounds" else said) == {"4": pytest.approx(0.58, abs=0.01)}
     assert not result.report["warnings"]
     assert result.evaluation.normalized_return > 0.9
+
+
+def test_bounds_are_of_coordinates_that_stand_still_within_an_episode():
+    """A place; commands, one of which hardly varies; without ends; a constant; drifts."""
+    episode = np.repeat(np.arange(4), 50)
+    states = np.random.default_rng(0).standard_normal((200, 7))
+    states[:, 1] = np.array([-1.0, 0.2, 0.5, 3.0])[episode]
+    states[:, 2] = 1e-4 * states[:, 2] + episode
+    states[:, 3], states[:, 4], states[:, 5] = episode, 7, 0.015 * states[:, 5] + episode
+    states[50:, 6] = episode[50:]
+    low, high = np.array([[-6, -6, -12, -np.inf, 7, 0, -9], [6, 6, 12, np.inf, 7, 3, 9]])
+    told = Spread.of("bounds", low, high, 7).among(states, episode)
+    assert told == pytest.approx({1: 12 / 12**0.5, 2: 24 / 12**0.5})
+    assert stands_still(states, episode).tolist() == [False, True, True, True, *[False] * 3]
 
 
 @pytest.mark.fault(204)

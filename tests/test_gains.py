@@ -7,6 +7,8 @@ from conftest import QUICK, TOY
 import fdtasil
 from fdtasil import gains
 from fdtasil.errors import ExpertError, SettingError
+from fdtasil.experts.load import load_expert
+from fdtasil.probes.derivatives import check_derivatives, comparison_rows
 
 N, M, HIDDEN = 6, 3, 64
 WEIGHTS = [
@@ -60,6 +62,16 @@ def test_the_noise_floor_is_the_noise():
     assert found.noise_floor == pytest.approx(np.full(M, 1e-2), rel=0.4)
 
 
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_the_error_of_a_law_that_bends_nowhere_is_that_of_its_noise(seed):
+    gain = np.random.default_rng(2).standard_normal((M, N)).astype(np.float32)
+    random = np.random.default_rng(seed)
+    law = lambda rows: rows @ gain.T + 0.01 * random.standard_normal((len(rows), M))  # noqa: E731
+    found = gains(law, STATES / SCALE, seed=seed)
+    apart = np.linalg.norm(np.sqrt(((found.jacobian - gain) ** 2).mean(axis=0)) * found.scale)
+    assert 0.75 < np.linalg.norm(found.error * found.scale) / apart < 1.35
+
+
 def test_a_linear_expert_is_exact_and_a_single_state_is_enough():
     gain = np.random.default_rng(2).standard_normal((2, 4)).astype(np.float32)
     found = gains(lambda rows: rows @ gain.T, np.zeros((1, 4)))
@@ -111,8 +123,17 @@ class Solver:
         return sensitive(observations)[1]
 
 
+class WritesIntoItsRows(Solver):
+    def jacobian(self, observations):
+        slopes = super().jacobian(observations)
+        observations[:] = 0
+        return slopes
+
+
 @pytest.mark.usefixtures("no_pictures")
-@pytest.mark.parametrize("expert", [sensitive, Solver()], ids=["function", "object"])
+@pytest.mark.parametrize(
+    "expert", [sensitive, Solver(), WritesIntoItsRows()], ids=["function", "object", "careless"]
+)
 def test_derivatives_that_an_expert_gives_are_the_analytic_reference(expert):
     result = fdtasil.distill(expert, TOY, probes="jacobian", progress=False, **QUICK)
     answers, states = result.dataset.answers, result.dataset.demonstrations.observations
@@ -138,8 +159,39 @@ def test_derivatives_of_something_else_are_named():
         fdtasil.distill(
             lambda rows: (sensitive(rows)[0], sensitive(rows)[1].transpose(0, 2, 1)), TOY, **run
         )
+    with pytest.raises(ExpertError, match=r"derivatives of shape \(\d+, 4, 5\)"):
+        fdtasil.distill(
+            lambda rows: (sensitive(rows)[0], np.tile(sensitive(rows)[1], (1, 2, 1))), TOY, **run
+        )
+    with pytest.raises(ExpertError, match="gives derivatives that are not finite"):
+        fdtasil.distill(lambda rows: sensitive(rows, sign=np.nan), TOY, **run)
     with pytest.raises(ExpertError, match="differentiated twice"):
         fdtasil.distill(sensitive, TOY, **{**run, "fit": fdtasil.Fit(steps=40, order=2)})
+
+
+def test_derivatives_that_are_nearly_those_of_the_actions_are_good_enough():
+    """Of a solver that ends early; a tenth too much is another law."""
+    rows = np.random.default_rng(0).standard_normal((50, 5)).astype(np.float32)
+    nearly, other = (
+        load_expert(lambda rows, s=s: sensitive(rows, sign=s), 5) for s in (1.01, 1.1)
+    )
+    check_derivatives(nearly, rows)
+    assert nearly.queries["probe"] == comparison_rows(5)
+    with pytest.raises(ExpertError, match="not those of its actions"):
+        check_derivatives(other, rows)
+
+
+@pytest.mark.parametrize("unit", [1e-3, 1e3])
+def test_a_wrong_derivative_is_found_whatever_the_unit_of_its_coordinate(unit):
+    units = np.array([unit, 1, 1, 1, 1])
+
+    def twice_the_first(rows):
+        answers, slopes = sensitive(rows / units.astype(np.float32))
+        return answers, slopes / units * [2, 1, 1, 1, 1]
+
+    rows = np.random.default_rng(0).standard_normal((50, 5)) * units
+    with pytest.raises(ExpertError, match=r"of action \d by coordinate 0 "):
+        check_derivatives(load_expert(twice_the_first, 5), rows.astype(np.float32))
 
 
 @pytest.mark.fault(235)

@@ -136,6 +136,15 @@ def test_labels_are_the_action_error_at_the_moved_states(states):
     assert float(loss.loss) == pytest.approx(float(loss.action_error + error), rel=1e-4)
 
 
+@pytest.mark.parametrize("spec", ["sphere:1,labels", "sphere:5,labels", "sphere:3,central,labels"])
+def test_a_label_weighs_the_same_for_every_number_of_them(states, spec):
+    expert = smooth_expert()
+    batch, stencil = batch_of(expert, spec, states)
+    loss = taylor_loss(lambda x: expert(x).detach() + 1, batch, stencil, Fit().weights("labels"))
+    assert float(loss.moved_error) == pytest.approx(3**0.5, rel=1e-4)
+    assert float(loss.loss) == pytest.approx(2 * 3**0.5, rel=1e-4)
+
+
 def test_both_are_the_sum_of_labels_and_differences(states):
     """Each difference is measured in units of its own distance."""
     expert, student = smooth_expert(), weaker_expert()
@@ -150,6 +159,31 @@ def test_both_are_the_sum_of_labels_and_differences(states):
     assert float(loss.derivative_error) == pytest.approx(float(change), rel=1e-4)
     expected = here.norm(dim=-1).mean() + 0.25 * change + 2 * there.norm(dim=-1).mean()
     assert float(loss.loss) == pytest.approx(float(expected), rel=1e-4)
+
+
+@pytest.mark.parametrize(
+    ("spec", "order", "weights"),
+    [
+        ("5,central,both", 2, Weights(0.5, 0.1, 1.0)),
+        ("jacobian", 2, Weights(0.5, 0.1)),
+        ("jacobian", 1, Weights(0.5)),
+        ("5", 1, None),
+    ],
+)
+def test_every_term_is_in_units_of_the_actions(states, spec, order, weights):
+    """Student and expert a thousand times as loud in one action, and as quiet in another."""
+    student, units = weaker_expert(), torch.tensor([1.0, 1e3, 1e-3])
+    batch, stencil = batch_of(smooth_expert(), spec, states, order)
+    if weights is None:
+        batch, stencil, weights = replace(batch, probes=None), None, Weights(None)
+    probes = batch.probes and replace(batch.probes, values=units * batch.probes.values)
+    scaled = replace(batch, actions=units * batch.actions, probes=probes)
+    usual = taylor_loss(student, batch, stencil, weights)
+    found = taylor_loss(lambda x: units * student(x), scaled, stencil, weights, units)
+    torch.testing.assert_close(torch.stack(found), torch.stack(usual), rtol=1e-3, atol=1e-6)
+    terms = [1.0, weights.derivative, weights.curvature, weights.moved]
+    parts = sum(weight * part for weight, part in zip(terms, usual[1:], strict=True) if weight)
+    assert float(usual.loss.detach()) == pytest.approx(float(parts.detach()))
 
 
 def test_distances_are_spread_evenly_over_their_orders_of_magnitude(states):

@@ -38,6 +38,48 @@ def test_the_best_weights_are_those_of_the_best_validation():
     assert float(student.weight) == 2.0
 
 
+def test_the_best_validation_is_remembered_over_an_interruption():
+    def fresh():
+        student = torch.nn.Linear(1, 1, device="meta").to_empty(device="cpu")
+        for weights in student.parameters():
+            torch.nn.init.zeros_(weights)
+        optimiser = torch.optim.AdamW(student.parameters(), lr=0.0)
+        student(torch.ones(1, 1)).sum().backward()
+        optimiser.step()
+        return student, FitState(student, optimiser)
+
+    def validate(student, state, weight, held_out):
+        with torch.no_grad():
+            student.weight.fill_(weight)
+        state.count(torch.ones(len(TaylorLoss._fields)))
+        state.log(held_out)
+
+    student, state = fresh()
+    validate(student, state, 1.0, 0.5)
+    validate(student, state, 2.0, 0.6)
+    again, resumed = fresh()
+    resumed.restore(state.to_bytes())
+    validate(again, resumed, 3.0, 0.55)
+    assert (resumed.step, resumed.stale, len(resumed.history)) == (3, 2, 3)
+    resumed.keep_best()
+    assert float(again.weight.detach()) == 1.0
+
+
+def test_an_entry_is_the_mean_of_the_steps_since_the_last_one():
+    student = torch.nn.Linear(1, 1, device="meta").to_empty(device="cpu")
+    for weights in student.parameters():
+        torch.nn.init.zeros_(weights)
+    state = FitState(student, torch.optim.AdamW(student.parameters()))
+    entries = []
+    for losses in ((1.0, 3.0), (5.0,)):
+        for loss in losses:
+            state.count(torch.full((len(TaylorLoss._fields),), loss))
+        entries.append(state.log(None))
+    assert [entry["step"] for entry in entries] == [2, 3]
+    assert [entry["loss"] for entry in entries] == [2.0, 5.0]
+    assert [entry["validation_loss"] for entry in entries] == [2.0, 5.0]
+
+
 def test_patience_stops_early(linear):
     held = Fit(steps=5000, validation=0.5, patience=2, learning_rate=1e-30)
     result = fdtasil.distill(linear, TOY, 0, **{**QUICK, "episodes": 4, "fit": held})
@@ -88,6 +130,7 @@ def test_callbacks_hear_of_everything(linear):
     kinds = [event.kind for event in heard]
     assert kinds == ["entry", "entry", "round"] * 3 + ["evaluation"]
     assert [event.round for event in heard if event.kind == "round"] == [0, 1, 2]
+    assert [event.step for event in heard if event.kind == "round"] == [200, 400, 600]
     assert heard[-1].evaluation == result.evaluation
     assert [event.entry for event in heard if event.kind == "entry"] == result.history
 

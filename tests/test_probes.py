@@ -41,7 +41,43 @@ def test_half_the_adaptive_directions_are_excursions_where_observations_are_redu
 def test_few_states_say_nothing_of_redundant_directions():
     """As many coordinates as states: what looks like few directions is few states."""
     assert not is_redundant(states(20, physical=3)[:20])
+    assert not is_redundant(np.ones((30, 20)))
     assert is_redundant(states(20, physical=3))
+
+
+def test_excursions_are_twice_as_long_as_states_of_two_passes_lie_apart():
+    """A way is gone twice, 0.2 apart: the steps along it are shorter, and lead nowhere new."""
+    way = np.stack([np.tile(np.linspace(0, 6, 200), 2), np.repeat([0, 0.2], 200)], axis=1)
+    frame, _ = np.linalg.qr(np.random.default_rng(0).standard_normal((20, 2)))
+    draw = AdaptiveDirections(10).around(way @ frame.T)
+    bank, _ = draw(300, np.random.default_rng(0))
+    along = bank @ frame
+    possible = np.linalg.norm(along, axis=1) > 0.999 * np.linalg.norm(bank, axis=1)
+    assert np.abs(along[possible, 0]).max() < 1e-5
+    assert (along[possible, 1] ** 2).mean() == pytest.approx((2 * 0.2) ** 2, rel=0.1)
+
+
+def test_half_of_the_probes_lead_to_possible_states_in_any_units():
+    """Functions of three coordinates are moved along them, whatever unit each has."""
+    units = 10.0 ** np.random.default_rng(1).uniform(-3, 3, 20)
+    rows = (states(20, physical=3) * units).astype(np.float32)
+    probes = PRESETS["standard"].complete(Probes.parse("10,radius=0.3")).with_order(1)
+    drawn = Surroundings.of(rows, probes, measure_scales(rows)).sample(np.random.default_rng(0))
+    moved = drawn.displacements / units
+    basis = np.linalg.svd(rows / units, full_matrices=False)[2][:3]
+    possible = np.linalg.norm(moved @ basis.T, axis=1) > 0.999 * np.linalg.norm(moved, axis=1)
+    assert 0.45 < possible.mean() < 0.55
+
+
+@pytest.mark.parametrize(
+    ("deviations", "redundant"),
+    [((1,) * 5 + (0.2,) * 7, False), ((1,) * 5 + (0.01,) * 7, True), ((1,) * 7 + (0,) * 5, False)],
+)
+def test_five_of_twelve_directions_are_few_where_they_hold_all_but_a_hundredth(
+    deviations, redundant
+):
+    """Five of twelve hold 95 % of the variance, or nearly all of it; seven are more than half."""
+    assert is_redundant(states(12) * deviations) == redundant
 
 
 @pytest.mark.parametrize("dimension", [1, 3, 17])
@@ -84,6 +120,7 @@ def test_the_mean_square_is_the_jacobians_where_parts_move_alone(design, spread)
     squares = ((drawn.gains[drawn.numbers][..., None] * moved) ** 2).sum(axis=-1)
     whole = ((jacobian * scales.deviation) ** 2).sum()
     assert squares.mean() == pytest.approx(whole, rel=0.05)
+    assert drawn.displacements.any(axis=1).all()
 
 
 @pytest.mark.fault(85)
@@ -92,6 +129,37 @@ def test_a_state_is_never_probed_along_the_same_direction_twice():
     _, frames = OrthogonalFrames(50).around(states(4))(3000, np.random.default_rng(0))
     for numbers in (sphere, frames[:, :4]):
         assert all(len(set(row)) == len(row) for row in numbers.tolist())
+
+
+def test_few_states_share_no_direction():
+    """A thousand directions are twenty-five times as many as those of one state."""
+    for design in (RandomSphere(40), AdaptiveDirections(40)):
+        _, numbers = design.around(states(4))(25, np.random.default_rng(0))
+        assert len(np.unique(numbers)) == 1000
+
+
+def test_frames_prefer_no_side():
+    """A forward difference tells one side of a kink: half of them must lie on each."""
+    bank, numbers = OrthogonalFrames(2).around(states(3))(9000, np.random.default_rng(0))
+    above = (bank.reshape(-1, 3, 3) > 0).mean(axis=0)
+    assert above == pytest.approx(np.full((3, 3), 0.5), abs=0.06)
+    assert len(np.unique(numbers)) > 0.95 * len(bank)
+
+
+def test_states_have_directions_of_their_own_where_answers_are_kept():
+    """Of those that are asked anew in a moment, some share them: drawing takes time."""
+    rows = states(4).astype(np.float32)
+    for spec, least in (("sphere:10", 2000), ("sphere:10,resample", 1000)):
+        probes = PRESETS["standard"].complete(Probes.parse(f"{spec},radius=1")).with_order(1)
+        drawn = Surroundings.of(rows, probes, measure_scales(rows))
+        assert len(np.unique(drawn.sample(np.random.default_rng(0)).numbers)) >= least
+
+
+@pytest.mark.parametrize("design", [RandomSphere(5000), OrthogonalFrames(8)])
+def test_many_probes_of_few_states_are_all_different(design):
+    for rows in (1, 3):
+        _, numbers = design.around(states(5))(rows, np.random.default_rng(0))
+        assert all(len(set(row)) == design.probes for row in numbers.tolist())
 
 
 def test_a_whole_frame_is_orthonormal():
@@ -145,6 +213,16 @@ def test_short_specs():
     assert few == Probes.parse("3,differences,resample,radius=wide")
     matches = [Probes.parse("fresh").with_order(order).match for order in (1, 2)]
     assert matches == ["labels", "both"]
+
+
+@pytest.mark.parametrize(
+    ("spec", "stencil"),
+    [("10,labels", FORWARD), ("10,both", FORWARD), ("10,radius=0.1..1", FORWARD), ("10", None),
+     ("10,both,central", CENTRAL)],
+)  # fmt: skip
+def test_a_label_needs_no_other_side(spec, stencil):
+    """Elsewhere a calibration finds whether both sides are asked, unless somebody says it."""
+    assert Probes.parse(spec).with_order(1, usual=None).stencil is stencil
 
 
 @pytest.mark.fault(84, 86)

@@ -195,6 +195,19 @@ def test_stopped_while_the_probes_are_asked_nothing_is_lost(kept, tmp_path, monk
     assert resumed.queries == whole.queries
 
 
+@pytest.mark.filterwarnings("ignore:.*asked (twice|alone)", "ignore:.*has changed during the run")
+def test_an_expert_that_does_not_repeat_itself_is_no_other_one(tmp_path):
+    """The gate was told to let it through."""
+    random, run = np.random.default_rng(0), {**QUICK, "probes": 0, "force": True}
+
+    def noisy(rows):
+        return 0.5 * np.tanh(rows[:, :2]) + random.normal(0, 0.01, (len(rows), 2))
+
+    with pytest.raises(Stop):
+        fdtasil.distill(noisy, TOY, out=tmp_path, callback=stop_at(1), **run)
+    fdtasil.distill(noisy, TOY, resume=tmp_path, **run)
+
+
 class WithDerivatives:
     """A linear law that says its own derivatives."""
 

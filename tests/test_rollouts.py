@@ -1,5 +1,7 @@
 """Rollouts: one episode a seed, masked after its end, the same whatever runs beside it."""
 
+from dataclasses import replace
+
 import gymnasium
 import numpy as np
 import pytest
@@ -7,8 +9,9 @@ from conftest import GAIN, TOY
 from toy_environments import Integrator
 
 from fdtasil.errors import EnvironmentFault, FdtasilWarning, SettingError
-from fdtasil.rollouts.behaviours import Decision, follow
+from fdtasil.rollouts.behaviours import Decision, farthest_apart, follow, random_behaviour
 from fdtasil.rollouts.environments import EnvironmentPool, resolve_horizon
+from fdtasil.rollouts.episodes import check_episodes
 from fdtasil.rollouts.rollout import rollout
 
 WALLED = "toy_environments:toy/Walled-v0"
@@ -35,6 +38,7 @@ def test_shapes_masks_and_ends():
         assert (length < 30) == episodes.terminated[e]
         assert not episodes.observations[e, length:].any()
         assert not episodes.rewards[e, length:].any()
+    assert (episodes.spread(300)[:, 4] == 3).all()  # the constant, of visited states alone
 
 
 def test_an_episode_does_not_depend_on_those_beside_it():
@@ -162,3 +166,46 @@ def test_other_data_than_a_simulators_is_left_alone():
             time = np.arange(3)
 
     assert run(Trades, [0], horizon=3).physics_resets.tolist() == [0]
+
+
+def test_what_can_be_learnt_from_an_experts_episodes():
+    """A single one may fall by chance, and so may a step be all there is."""
+    episodes = run(TOY, range(4), horizon=5)
+    short = np.tile(np.arange(5) < 1, (4, 1))
+    resets = np.array([1, 2, 0, 0])
+    for good in (
+        episodes,
+        replace(episodes, physics_resets=resets),
+        replace(episodes, valid=short | (np.arange(4) == 2)[:, None]),
+        replace(episodes, valid=short[:1]),
+        replace(episodes, valid=short[:, :1]),
+    ):
+        check_episodes(good, "toy")
+    with pytest.raises(EnvironmentFault, match="reset itself in 3 of 4 episodes"):
+        check_episodes(replace(episodes, physics_resets=resets[[0, 1, 1, 2]]), "toy")
+    with pytest.raises(
+        EnvironmentFault, match="all 4 episodes of the expert ended at their first"
+    ):
+        check_episodes(replace(episodes, valid=short), "toy")
+
+
+def test_random_actions_are_uniform_between_bounds_and_normal_without():
+    class Free(Integrator):
+        def __init__(self):
+            super().__init__()
+            ends = np.float32([-1, -np.inf]), np.float32([3, np.inf])
+            self.action_space = gymnasium.spaces.Box(*ends)
+
+    with EnvironmentPool(Free) as pool:
+        act, random = random_behaviour(pool), np.random.default_rng(0)
+        bounded, free = act(np.zeros((4000, 5)), [random] * 4000).action.T
+    shares = np.histogram(bounded, bins=[-1, 0, 1, 2, 3])[0] / 4000
+    assert shares == pytest.approx([0.25] * 4, abs=0.03)
+    assert (free.mean(), free.std()) == pytest.approx((0, 1), abs=0.05)
+
+
+def test_answers_are_compared_where_both_are_some():
+    ours, theirs = np.array([[np.nan, 1, 2, 9], [0, np.nan, 5, 9]])[..., None]
+    ours, theirs = (np.pad(one, [(0, 0), (0, 1)]) for one in (ours, theirs))  # and a whole action
+    assert farthest_apart(ours, theirs) == 3
+    assert farthest_apart(ours[:2], theirs[:2]) == 0

@@ -1,6 +1,7 @@
 """Experts without an answer here and there: what has none is left out, and counted."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -173,8 +174,20 @@ def test_episodes_that_were_cut_short_are_said_beside_the_returns():
     with pytest.warns(fdtasil.FdtasilWarning, match="episodes of the expert were ended"):
         found = fdtasil.evaluate(always, lost, TOY, episodes=6, horizon=40, force=True)
     assert found.given_up == 0 < found.expert_given_up < 6
+    assert found.action_error == pytest.approx(0, abs=1e-6)  # where the expert has an answer
+    assert found.expert_survival <= 1 - found.expert_given_up / 6 < found.survival
     assert f"cut short         {found.expert_given_up:10}   episodes, for the expert" in str(found)
     assert "cut short" in found._repr_html_()
+
+
+def test_demonstrations_that_were_cut_short_are_counted():
+    def lost(rows):
+        answers = rows @ GAIN.T
+        answers[rows[:, 0] > 0.5] = np.nan
+        return answers
+
+    run = {**QUICK, "episodes": 6, "horizon": 40, "probes": 0, "force": True}
+    assert 0 < fdtasil.distill(lost, TOY, **run).report["given_up_episodes"] <= 6
 
 
 def test_the_last_action_is_held_for_a_while_and_then_the_episode_ends():
@@ -210,6 +223,10 @@ def test_a_state_without_any_answered_probe_is_asked_about_itself():
     moved = ROWS[:, None] + answers.displacements[answers.numbers]
     assert answers.values[:, :, 0] == pytest.approx(moved @ GAIN.T, abs=1e-5)
     assert (moved[:, 0] == ROWS).all(axis=1).sum() == 14
+    labelled, expert = replace(around, actions=ROWS @ GAIN.T), load_expert(island)
+    again = ask_probes(expert, labelled, np.random.default_rng(0))
+    assert expert.queries["probe"] == 40  # and none about a state whose label is known
+    assert again.values == pytest.approx(answers.values, abs=1e-6)
 
 
 class Stop(Exception):

@@ -30,7 +30,7 @@ def off_by(error):
     return lambda rows: (rows @ GAIN.T + error).astype(np.float32)
 
 
-def decide(trainer, round_, student, rows=ROWS):
+def decide(trainer, round_, student, rows=ROWS, chooses=False):
     with EnvironmentPool(TOY) as pool:
         expert = load_expert(linear, 5, 2)
 
@@ -38,7 +38,8 @@ def decide(trainer, round_, student, rows=ROWS):
             noise = [np.random.default_rng(e) for e in range(count)]
             return rollout(behaviour, pool, range(count), 20, noise)
 
-        behaviour = trainer.behaviour(Situation(round_, expert, HALF, student, record))
+        situation = Situation(round_, expert, HALF, student, record, chooses)
+        behaviour = trainer.behaviour(situation)
         asked = dict(expert.queries)
         decision = behaviour(rows, [np.random.default_rng(e) for e in range(len(rows))])
     return decision, asked
@@ -109,9 +110,17 @@ def test_dagger_switches():
     assert theirs.mean() == pytest.approx(0.3, abs=0.07)
 
 
+def test_dagger_takes_the_choice_of_one_of_both():
+    """The mean of two scores is the best of nobody."""
+    decision, _ = decide(DAgger(), 1, off_by(1), chooses=True)
+    assert set(np.round(decision.action - linear(ROWS), 5).flat) == {0, 1}
+
+
 def test_a_student_alone_is_labelled_afterwards():
     decision, _ = decide(DAgger(beta=0.0), 1, off_by(1))
     assert decision.expert_action is None
+    never = DAgger(updates=(1,), beta=lambda round_: 0.0)  # but there is no student at first
+    assert never.queries(3, 10) == {"act": 10, "label": 20}
     result = fdtasil.distill(linear, TOY, 0, trainer=DAgger(beta=0.0), **{**QUICK, "episodes": 3})
     assert result.queries["act"] == 20
     assert result.queries["label"] == 40
@@ -189,3 +198,11 @@ def test_wrong_settings_are_refused(wrong):
 def test_one_episode_is_one_round(trainer, linear):
     with pytest.warns(FdtasilWarning, match="leave trainer="):
         fdtasil.distill(linear, TOY, 0, trainer=trainer, **{**QUICK, "episodes": 1})
+
+
+@pytest.mark.filterwarnings("ignore:.*leaves the action bounds")
+def test_what_happened_is_counted_over_all_rounds():
+    """The expert acts in each of three, at twice what the environment takes."""
+    run = {**QUICK, "episodes": 3, "trainer": DAgger(updates=(1, 2), beta=1.0), "force": True}
+    result = fdtasil.distill(lambda rows: -2 * np.sign(rows[:, :2]), TOY, 0, **run)
+    assert result.report["clipped_actions"] == len(result.demonstrations) == 60

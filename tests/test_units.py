@@ -6,7 +6,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from conftest import GAIN, QUICK
+from conftest import GAIN, QUICK, TOY
 from toy_environments import Integrator
 from toy_tasks import linear_task, stream
 
@@ -150,6 +150,18 @@ def test_dust_is_no_movement():
     assert scales.scale[2] == 1.0
 
 
+def test_what_moves_in_float32_is_live_beside_any_offset_and_unit():
+    """Three hundredths of a kelvin at 300; of a second at a million, they are rounding."""
+    states = np.random.default_rng(0).standard_normal((100, 4)) * [1.0, 2.0, 0.03, 0.03]
+    scales = measure_scales(states * [1e12, 1, 1, 1] + [0, 0, 300, 1e6])
+    assert scales.live.tolist() == [True, True, True, False]
+    assert scales.units[2:] == pytest.approx([states[:, 2].std(), 1.0])
+    told = scales.spread_by({3: 0.5})
+    assert told.live.all()
+    assert told.told.tolist() == [False, False, False, True]
+    assert told.deviation[3] == told.scale[3] == told.units[3] == 0.5
+
+
 @pytest.mark.fault(231)
 def test_bounds_as_large_as_float32_are_none():
     largest = float(np.finfo(np.float32).max)
@@ -220,6 +232,14 @@ def test_another_expert_is_found_by_an_action_in_small_numbers_too(unit, tmp_pat
         fdtasil.distill(law, scaled_actions(unit), out=tmp_path, callback=lambda _: 1 / 0, **run)
     with pytest.raises(SettingError, match="begun with another expert"):
         fdtasil.distill(other, scaled_actions(unit), resume=tmp_path, **run)
+
+
+def test_an_action_that_is_rounding_makes_no_expert_another(tmp_path):
+    law = lambda rows, sign=1: np.tanh(rows[:, :2]) * [1.0, sign * 1e-8]  # noqa: E731
+    run = {**QUICK, "probes": 0}
+    with pytest.raises(ZeroDivisionError):
+        fdtasil.distill(law, TOY, out=tmp_path, callback=lambda _: 1 / 0, **run)
+    fdtasil.distill(lambda rows: law(rows, -1), TOY, resume=tmp_path, **run)
 
 
 @pytest.mark.fault(274)
