@@ -106,9 +106,8 @@ class Calibration:
         usual = WIDE if self.switches else self.radius
         radius = usual if probes.radius is None else probes.radius
         if radius == "wide":
-            nearest = self._nearest()
-            radius = max(WIDE[0], nearest), max(WIDE[1], nearest)
-        elif probes.radius is not None and probes.space == "whitened":
+            radius = max(WIDE[0], self._nearest()), WIDE[1]
+        elif probes.radius is not None:
             for end in sorted(set(replace(probes, radius=radius).reaches)):
                 self._warn_of(end)
         stencil = CENTRAL if self.stencil == "central" else FORWARD

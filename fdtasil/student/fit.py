@@ -138,7 +138,7 @@ class Fit:
 
     def held_out(self, episodes: int) -> int:
         """Return how many of `episodes` episodes are held out."""
-        if self.validation == 0 or episodes < 2:
+        if self.validation == 0:
             return 0
         return min(max(1, round(self.validation * episodes)), episodes - 1)
 
