@@ -148,3 +148,17 @@ def test_a_law_switches_where_each_action_has_two_or_three_values(law):
 @pytest.mark.parametrize("rows", [2_100, 9_000, 12_000, 1_000_000])
 def test_a_calibration_takes_a_tenth_of_the_probes_at_most(rows):
     assert ladder_for(rows).queries <= 0.1 * rows
+
+
+@pytest.mark.parametrize("gain", [1.5, 3, 6])
+def test_a_law_that_is_mostly_at_its_bounds_has_its_derivative_between_them(gain):
+    """At half of the states, at three quarters, at nearly nine of ten."""
+    found = found_of(lambda x: np.clip(gain * x[:, :1], -1, 1))
+    assert (found.regime, found.radius) == ("smooth", 0.3)
+
+
+@pytest.mark.parametrize("depth", [2, 8])
+def test_a_tree_has_none_whatever_its_size(depth):
+    ends = np.random.default_rng(0).standard_normal((depth, 5))
+    found = found_of(lambda x: (x @ ends.T > 0).sum(axis=1, keepdims=True) / depth)
+    assert found.regime == "steps"

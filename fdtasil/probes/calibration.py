@@ -54,7 +54,7 @@ _ROUGH_RADIUS = 0.5
 # steep for the scale that it is probed at: a swing-up that ends in a stiff balance has 2.4,
 # networks that walk 0.5 to 1. Differences alone then count more than the actions do.
 _STEEP = 1.5
-_RAYS = 4  # that are answered throughout, at least
+_RAYS = 4  # that are answered throughout, or along which something changes, at least
 _NOISY_FROM = 4.0**-6  # smallest radius with a derivative; float32 rounding stays below it
 _NOISY_SHARE = 0.3  # of noise in a difference; above it a given radius is warned of
 WIDE = (0.2, 2.0)
@@ -280,10 +280,16 @@ def _answered(
 
 
 def _similarity(wide: np.ndarray, narrow: np.ndarray) -> np.ndarray:
-    """Return the mean over rays of 2 <a, b> / (|a|^2 + |b|^2), one number for each radius."""
+    """Return the mean over rays of 2 <a, b> / (|a|^2 + |b|^2), one number for each radius.
+
+    Rays along which nothing changes say nothing: a law that is at a bound at most of its states
+    has its derivative at the others. Where nearly all of them are still, as near the states of a
+    tree, it is 0.
+    """
     both = (wide**2).sum(axis=-1) + (narrow**2).sum(axis=-1)
     product = 2 * (wide * narrow).sum(axis=-1)
-    return np.where(both > 0, product / np.where(both > 0, both, 1), 0.0).mean(axis=0)
+    each, moving = product / np.where(both > 0, both, 1), (both > 0).sum(axis=0)
+    return np.where(moving >= _RAYS, each.sum(axis=0) / np.maximum(moving, 1), 0.0)
 
 
 def _judge(
