@@ -55,10 +55,12 @@ def c_header(policy: PlainPolicy, order: str = "") -> str:
         f"/* Written by fdtasil.{told}*/\n"
         "#ifndef STUDENT_H\n#define STUDENT_H\n\n"
         f"#define STUDENT_OBSERVATIONS {n}\n#define STUDENT_ACTIONS {m}\n\n"
+        '#ifdef __cplusplus\nextern "C" {\n#endif\n'
         f"/* {_answer(policy)}\n"
         "   Not reentrant: its buffers are static. */\n"
         "void student(const float observation[STUDENT_OBSERVATIONS],\n"
-        "             float action[STUDENT_ACTIONS]);\n\n"
+        "             float action[STUDENT_ACTIONS]);\n"
+        "#ifdef __cplusplus\n}\n#endif\n\n"
         "#endif\n"
     )
 
