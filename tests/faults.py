@@ -299,6 +299,7 @@ FAULTS = {
         271: "a student that is judged in another environment than its own",
         278: "a dataset of later rounds alone, or of reversed arrays and doubles",
         279: "bounds, or ends of episodes, that are not those of the arrays",
+        282: "an action with one bound, which an exported student passes",
         270: "trust that does not reach the policy that asks for it",
     },
 }

@@ -1,6 +1,7 @@
 """A student as C and in numpy: the same answers, and nothing that a board does not have."""
 
 import pickle
+import shutil
 import subprocess
 
 import gymnasium
@@ -170,6 +171,47 @@ def test_the_header_fits(tmp_path):
     subprocess.run(
         [compiler(), "-std=c99", "-Wall", "-Werror", "-c", *files], cwd=tmp_path, check=True
     )
+
+
+def linked(folder, linker, *files):
+    """Return what a program of object files prints, as numbers."""
+    subprocess.run([linker, "-o", "program", *files, "-lm"], cwd=folder, check=True)
+    said = subprocess.run([folder / "program"], capture_output=True, text=True, check=True)
+    return [float(number) for number in said.stdout.split()]
+
+
+@needs_a_compiler
+@pytest.mark.skipif(shutil.which("g++") is None, reason="needs a C++ compiler")
+def test_a_program_in_cpp_calls_it(tmp_path):
+    student = make((8,))
+    for name in ("student.h", "student.c"):
+        (tmp_path / name).write_bytes(export(student, NEAR, {}, name))
+    (tmp_path / "robot.cpp").write_text(
+        '#include <cstdio>\n#include "student.h"\n'
+        "int main() { const float x[STUDENT_OBSERVATIONS] = {5, 1, 2}; float u[STUDENT_ACTIONS];\n"
+        'student(x, u); for (float one : u) std::printf("%.9g ", double(one)); }\n'
+    )
+    subprocess.run([compiler(), "-std=c99", "-c", "student.c"], cwd=tmp_path, check=True)
+    answer = linked(tmp_path, "g++", "robot.cpp", "student.o")
+    assert answer == pytest.approx(student.predict([5, 1, 2])[0], abs=1e-5)
+
+
+@needs_a_compiler
+def test_two_students_are_one_program(tmp_path):
+    students = {"walk": make((8,)), "stand": make((4, 4), "relu", seed=1)}
+    for (name, student), suffix in zip(students.items(), (".c", ".int8.c"), strict=True):
+        (tmp_path / f"{name}.c").write_bytes(export(student, NEAR, {}, f"student{suffix}"))
+        command = [compiler(), "-std=c99", f"-Dstudent={name}", "-c", f"{name}.c"]
+        subprocess.run(command, cwd=tmp_path, check=True)
+    (tmp_path / "robot.c").write_text(
+        "#include <stdio.h>\nvoid walk(const float *, float *);\n"
+        "void stand(const float *, float *);\n"
+        "int main(void) { float x[3] = {5, 1, 2}, u[4]; int i; walk(x, u); stand(x, u + 2);\n"
+        'for (i = 0; i < 4; i++) printf("%.9g ", u[i]); return 0; }\n'
+    )
+    answers = linked(tmp_path, compiler(), "robot.c", "walk.o", "stand.o")
+    expected = [student.predict([5, 1, 2])[0] for student in students.values()]
+    assert answers == pytest.approx(np.concatenate(expected), abs=2e-2)
 
 
 @needs_a_compiler

@@ -55,10 +55,12 @@ def c_header(policy: PlainPolicy, order: str = "") -> str:
         f"/* Written by fdtasil.{told}*/\n"
         "#ifndef STUDENT_H\n#define STUDENT_H\n\n"
         f"#define STUDENT_OBSERVATIONS {n}\n#define STUDENT_ACTIONS {m}\n\n"
+        '#ifdef __cplusplus\nextern "C" {\n#endif\n'
         f"/* {_answer(policy)}\n"
         "   Not reentrant: its buffers are static. */\n"
         "void student(const float observation[STUDENT_OBSERVATIONS],\n"
-        "             float action[STUDENT_ACTIONS]);\n\n"
+        "             float action[STUDENT_ACTIONS]);\n"
+        "#ifdef __cplusplus\n}\n#endif\n\n"
         "#endif\n"
     )
 
@@ -124,7 +126,9 @@ def c_source(policy: PlainPolicy, about: Mapping[str, str], layers: Layers | Non
             ),
             "    for (i = 0; i < STUDENT_ACTIONS; i++)",
             "        action[i] = centre[i]\n"
-            "            + half[i] * (bounded[i] > 0.0f ? tanhf(raw[i]) : raw[i]);\n}\n",
+            "            + half[i] * (bounded[i] > 0.0f ? tanhf(raw[i]) : raw[i]);",
+            *([] if policy.cut is None else [_CUT]),
+            "}\n",
             _MAIN,
         ]
     )
@@ -148,6 +152,8 @@ def _constants(policy: PlainPolicy, held: list[Mapping[str, np.ndarray]]) -> dic
     for number, (_, biases) in enumerate(policy.layers):
         arrays |= {**held[number], f"b{number}": biases}
     arrays |= {"bounded": policy.bounded, "centre": policy.centre, "half": policy.half}
+    if policy.cut is not None:
+        arrays["low"], arrays["high"] = policy.cut
     return {name: _plain(array) for name, array in arrays.items()}
 
 
@@ -180,6 +186,8 @@ def _number(value: np.generic) -> str:
     if isinstance(value, np.integer):
         return str(value)
     text = f"{float(value):.9g}"  # reads back as the same float32
+    if np.isinf(value):  # the bound that an action does not have
+        return text.replace("inf", "INFINITY")
     return text + ("f" if set(text) & set(".e") else ".0f")
 
 
@@ -221,6 +229,9 @@ _LINEAR = """static void linear(const float *weights, const float *biases, const
     }
 }
 """
+# What is no number stays none.
+_CUT = """    for (i = 0; i < STUDENT_ACTIONS; i++)
+        action[i] = action[i] < low[i] ? low[i] : action[i] > high[i] ? high[i] : action[i];"""
 FLOAT = Layers(
     lambda number, weights: {f"w{number}": weights}, lambda widest: _LINEAR, lambda widest: 0, 1e-5
 )

@@ -223,7 +223,7 @@ def fit(
     units = student.action_units if bool((student.action_units != 1).any()) else None
 
     def loss_of(batch: Minibatch) -> TaylorLoss:
-        return taylor_loss(student, batch, stencil, weights, units)
+        return taylor_loss(student.uncut, batch, stencil, weights, units)
 
     step = gradient_step(student, optimiser, loss_of, settings.max_gradient_norm, device)
     first_epoch = state.step // per_epoch

@@ -45,7 +45,6 @@ class History:
                 "pass the history that it was trained with",
             )
         self._student, self._history = student, history
-        self._bounds = student.low.cpu().numpy(), student.high.cpu().numpy()
         self._window = Window(history, self.observation_size, m)
 
     def predict(
@@ -85,10 +84,8 @@ class History:
             )
         rows = self._window.behind(seen)[None].astype(np.float32)
         action, spaces = self._student.answer(rows)[0], self._student.spaces
-        # Beyond its one bound the environment cuts an action off: what is done is remembered.
-        taken = np.clip(action, *self._bounds)
         if spaces is None:
-            self._window.push(seen, taken)
+            self._window.push(seen, action)
             return action, None
-        self._window.push(seen, spaces.actions.done(taken))
+        self._window.push(seen, spaces.actions.done(action))
         return spaces.actions.value(action), None

@@ -1,14 +1,18 @@
 """The Taylor loss: match the expert's actions, and its differences along the probes."""
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from fdtasil.probes.stencils import Stencil
 
 __all__ = ["Minibatch", "ProbeBatch", "TaylorLoss", "Weights", "taylor_loss"]
+
+Network = Callable[[Tensor], Tensor]
+"""A student as it is trained: (B, n) -> (B, m)."""
 
 
 @dataclass(frozen=True)
@@ -80,7 +84,7 @@ class TaylorLoss(NamedTuple):
 
 
 def taylor_loss(
-    student: nn.Module,
+    student: Network,
     batch: Minibatch,
     stencil: Stencil | None,
     weights: Weights,
@@ -101,7 +105,7 @@ def taylor_loss(
 
     Example:
         >>> batch = Minibatch(torch.zeros(2, 3), torch.ones(2, 3))
-        >>> taylor_loss(nn.Identity(), batch, None, Weights(0.0)).loss
+        >>> taylor_loss(torch.nn.Identity(), batch, None, Weights(0.0)).loss
         tensor(1.7321)
     """
     probes = batch.probes
@@ -144,7 +148,7 @@ class _Errors(NamedTuple):
 
 
 def _asked_errors(
-    student: nn.Module, batch: Minibatch, probes: ProbeBatch, stencil: Stencil, weights: Weights
+    student: Network, batch: Minibatch, probes: ProbeBatch, stencil: Stencil, weights: Weights
 ) -> _Errors:
     (rows, n), values = batch.observations.shape, probes.values
     # Numbers, not tensors of them: a tensor would wait for the GPU at every step.
@@ -172,7 +176,7 @@ def _asked_errors(
 
 
 def _exact_errors(
-    student: nn.Module, batch: Minibatch, probes: ProbeBatch, stencil: Stencil, weights: Weights
+    student: Network, batch: Minibatch, probes: ProbeBatch, stencil: Stencil, weights: Weights
 ) -> _Errors:
     directions, values = probes.displacements, probes.values
     count, actions = directions.shape[1], batch.actions.shape[1]
@@ -190,7 +194,7 @@ def _exact_errors(
     return _Errors(action_error, action_error, errors[0], errors[-1])
 
 
-def _jacobian(student: nn.Module, states: Tensor) -> tuple[Tensor, Tensor]:
+def _jacobian(student: Network, states: Tensor) -> tuple[Tensor, Tensor]:
     """Return f(x), (B, m), and its Jacobian, (m, B, n), differentiable."""
     states = states.detach().requires_grad_()
     answers = student(states)
@@ -202,7 +206,7 @@ def _jacobian(student: nn.Module, states: Tensor) -> tuple[Tensor, Tensor]:
 
 
 def _derivative_along(
-    student: nn.Module, states: Tensor, directions: Tensor
+    student: Network, states: Tensor, directions: Tensor
 ) -> tuple[Tensor, Tensor]:
     """Return f(x) and J u, each (B, m), differentiable.
 
@@ -218,7 +222,7 @@ def _derivative_along(
 
 
 def _second_derivative_along(
-    student: nn.Module, states: Tensor, directions: Tensor
+    student: Network, states: Tensor, directions: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return f(x), J u and u'H u, each (B, m), differentiable."""
 

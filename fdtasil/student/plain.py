@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-__all__ = ["PLAIN", "PlainPolicy", "choices_of"]
+__all__ = ["PLAIN", "PlainPolicy", "choices_of", "cut_of"]
 
 
 def _gelu(x: np.ndarray) -> np.ndarray:
@@ -79,6 +79,7 @@ class PlainPolicy:
         half: (m,) half the range of each.
         choices: Start and end of the scores of each choice, and its first value; () where actions
             are numbers.
+        cut: Where actions are cut off; see `cut_of`.
     """
 
     mean: np.ndarray
@@ -89,6 +90,7 @@ class PlainPolicy:
     centre: np.ndarray
     half: np.ndarray
     choices: Sequence[tuple[int, int, int]] = ()
+    cut: tuple[np.ndarray, np.ndarray] | None = None
 
     @classmethod
     def load(cls, path: str | Path = "student.safetensors") -> "PlainPolicy":
@@ -113,7 +115,7 @@ class PlainPolicy:
             raise ValueError(f"the activation {bend!r}, where one of {', '.join(PLAIN)} is known")
         parts = about.get("spaces", {}).get("actions", [])
         plain = tensors["mean"], tensors["scale"], layers, bend, bounded, centre, half
-        return cls(*plain, choices_of(parts))
+        return cls(*plain, choices_of(parts), cut_of(low, high))
 
     def choose(self, observation: np.ndarray) -> np.ndarray:
         """(n,) or (B, n) raw observations -> (c,) or (B, c), the best of each choice."""
@@ -135,7 +137,8 @@ class PlainPolicy:
             value = bend(value)
         value = value @ weights.T + biases
         squashed = np.where(self.bounded, np.tanh(value), value)
-        return (self.centre + self.half * squashed).astype(np.float32)
+        actions = (self.centre + self.half * squashed).astype(np.float32)
+        return actions if self.cut is None else np.clip(actions, *self.cut)
 
 
 def _safetensors(data: bytes) -> tuple[dict[str, np.ndarray], dict]:
@@ -168,3 +171,12 @@ def choices_of(parts: Sequence[dict]) -> list[tuple[int, int, int]]:
         if not part["sizes"]:
             start += int(np.prod(part["shape"]))
     return found
+
+
+def cut_of(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:
+    """Return the (m,) bounds that actions are cut off at; None where no bound stands alone.
+
+    The tanh of an action with two bounds keeps to them by itself.
+    """
+    alone = np.isfinite(low) != np.isfinite(high)
+    return (low, high) if alone.any() else None

@@ -17,7 +17,7 @@ from fdtasil.files.tensors import tensors_from_bytes, tensors_to_bytes
 from fdtasil.probes.scales import Scales
 from fdtasil.rollouts.spaces import Mismatch, Spaces
 from fdtasil.student.architectures import Architecture, Mlp, architecture_of, describe
-from fdtasil.student.plain import PlainPolicy, choices_of
+from fdtasil.student.plain import PlainPolicy, choices_of, cut_of
 
 __all__ = ["Student"]
 
@@ -34,8 +34,9 @@ class Student(nn.Module):
         architecture: Of the network.
         mean: (n,) subtracted from observations.
         scale: (n,) divided by; positive.
-        low: (m,) action bounds; the output of a bounded action is a scaled tanh.
-        high: (m,) upper bounds; where a bound is infinite the output is linear.
+        low: (m,) action bounds; the output of an action with two is a scaled tanh.
+        high: (m,) upper bounds; where one is infinite the output is linear, and cut off at the
+            other if that is finite.
         random: Draws the initial weights.
         actions: Scales of the expert's actions, in which linear outputs are; None for ones.
         spaces: Of what it sees and does, where they are no plain boxes: `predict` takes and
@@ -79,6 +80,7 @@ class Student(nn.Module):
         self.register_buffer("_centre", torch.from_numpy(centre).float(), persistent=stored)
         self.register_buffer("_half", torch.from_numpy(half).float(), persistent=stored)
         self._all_bounded = bool(bounded.all())
+        self._cuts = cut_of(low, high) is not None
         self._plain: tuple[list[int], PlainPolicy | None] | None = None
 
     @property
@@ -92,7 +94,15 @@ class Student(nn.Module):
         return len(self.low)
 
     def forward(self, observations: Tensor) -> Tensor:
-        """(B, n) raw observations -> (B, m) actions in environment units."""
+        """(B, n) raw observations -> (B, m) actions in environment units, inside the bounds."""
+        actions = self.uncut(observations)
+        return actions.clamp(self.low, self.high) if self._cuts else actions
+
+    def uncut(self, observations: Tensor) -> Tensor:
+        """Answer as `forward` does, and beyond a bound that stands alone.
+
+        This is what is trained: where actions are cut off, they have no gradient.
+        """
         raw = self.network((observations - self.mean) / self.scale)
         squashed = torch.tanh(raw)
         if not self._all_bounded:
@@ -115,6 +125,9 @@ class Student(nn.Module):
         for operator, constant, idle in (("Mul", self._half, 1), ("Add", self._centre, 0)):
             if (constant != idle).any():
                 actions = nodes.node(operator, actions, nodes.constant(constant))
+        if self._cuts:
+            for operator, bound in (("Max", self.low), ("Min", self.high)):
+                actions = nodes.node(operator, actions, nodes.constant(bound))
         return actions
 
     @property
@@ -147,6 +160,7 @@ class Student(nn.Module):
             self._centre.numpy(),
             self._half.numpy(),
             choices_of(self.spaces.to_json()["actions"]) if self.spaces else (),
+            cut_of(self.low.numpy(), self.high.numpy()),
         )
 
     def act(self, observations: np.ndarray) -> np.ndarray:

@@ -71,6 +71,10 @@ def _written(graph: "_Graph", policy: PlainPolicy, about: Mapping[str, str]) -> 
         value = squashed
     value = graph.apply("MUL", [value, graph.constant("half", policy.half)])
     value = graph.apply("ADD", [value, graph.constant("centre", policy.centre)])
+    if policy.cut is not None:
+        low, high = policy.cut  # in this order what is no number stays none
+        value = graph.apply("MAXIMUM", [graph.constant("low", low), value])
+        value = graph.apply("MINIMUM", [graph.constant("high", high), value])
     graph.rename(value, "scores" if policy.choices else "actions")
     return graph.model(given, value, json.dumps(dict(about)))
 
