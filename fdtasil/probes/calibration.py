@@ -201,11 +201,11 @@ def calibrate(
         values, centres = _answered(values, centres, expert)
         radii = radii[: values.shape[1]]
     secants = (values[:, :, 0] - values[:, :, 1]) / (2 * radii[None, :, None])
-    similarity = _similarity(secants[:, 1:], secants[:, :-1])
+    similarity, moving = _similarity(secants[:, 1:], secants[:, :-1])
     second = values[:, 0, 0] + values[:, 0, 1] - 2 * centres
     floor = float(np.sqrt((second**2).mean() / 6))
     change = np.sqrt(((values - centres[:, None, None, :]) ** 2).mean(axis=(0, 2, 3)))
-    regime, radius, stencil = _judge(similarity, radii[1:], usual)
+    regime, radius, stencil = _judge(similarity, moving, radii[1:], usual)
     radius = min(radius, float(radii[-1]))  # where it still answers
     varied = np.sqrt(centres.var(axis=0).mean())
     steep = np.interp(np.log(radius), np.log(radii), change) > _STEEP * varied
@@ -279,23 +279,24 @@ def _answered(
     )
 
 
-def _similarity(wide: np.ndarray, narrow: np.ndarray) -> np.ndarray:
-    """Return the mean over rays of 2 <a, b> / (|a|^2 + |b|^2), one number for each radius.
+def _similarity(wide: np.ndarray, narrow: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return the mean over moving rays of 2 <a, b> / (|a|^2 + |b|^2), and the share that moves.
 
-    Rays along which nothing changes say nothing: a law that is at a bound at most of its states
+    One number of each for each radius. Rays along which nothing changes say nothing: a law that is at a bound at most of its states
     has its derivative at the others. Where nearly all of them are still, as near the states of a
     tree, it is 0.
     """
     both = (wide**2).sum(axis=-1) + (narrow**2).sum(axis=-1)
     product = 2 * (wide * narrow).sum(axis=-1)
     each, moving = product / np.where(both > 0, both, 1), (both > 0).sum(axis=0)
-    return np.where(moving >= _RAYS, each.sum(axis=0) / np.maximum(moving, 1), 0.0)
+    similarity = np.where(moving >= _RAYS, each.sum(axis=0) / np.maximum(moving, 1), 0.0)
+    return similarity, moving / len(both)
 
 
 def _judge(
-    similarity: np.ndarray, radii: np.ndarray, usual: float
+    similarity: np.ndarray, moving: np.ndarray, radii: np.ndarray, usual: float
 ) -> tuple[Literal["smooth", "noisy", "steps"], float, str]:
-    """Return regime, radius and stencil from the similarity at each radius but the smallest."""
+    """Return regime, radius and stencil from what `_similarity` says of all radii but one."""
     coherent = np.flatnonzero(similarity >= _COHERENT)
     if not len(coherent) or radii[coherent[-1]] < 1e-3:
         return "steps", max(usual, _ROUGH_RADIUS), "central"
@@ -304,5 +305,6 @@ def _judge(
     low = float(radii[coherent[0]])
     regime = "noisy" if coherent[0] > 0 and low > _NOISY_FROM else "smooth"
     radius = max(usual, low)
-    here = float(np.interp(np.log(radius), np.log(radii), similarity))
+    # Where many rays are still, a kink is near the others: both sides teach better there too.
+    here = float(np.interp(np.log(radius), np.log(radii), similarity * moving))
     return regime, radius, "central" if regime == "noisy" or here < _ROUGH else "forward"

@@ -21,6 +21,11 @@ from fdtasil.student.plain import PlainPolicy, choices_of, cut_of
 
 __all__ = ["Student"]
 
+_AS_SEEN = (
+    "pass raw observations, of student_obs= that part alone; of a student with a history, ask "
+    "fdtasil.History"
+)
+
 _ENTRY = "fdtasil"  # of the metadata of a file of weights
 
 
@@ -201,7 +206,7 @@ class Student(nn.Module):
             raise SettingError(
                 f"observation of shape {rows.shape}",
                 f"({n},) or (B, {n})",
-                "pass raw observations; of a student with a history, ask fdtasil.History",
+                _AS_SEEN,
             )
         actions = self.answer(np.atleast_2d(rows))
         return (actions[0] if rows.ndim == 1 else actions), state
@@ -220,7 +225,7 @@ class Student(nn.Module):
             raise SettingError(
                 f"an observation with {mismatch}",
                 f"what the environment gives{f': {names}' if names else ''}, or flat rows",
-                "pass raw observations",
+                _AS_SEEN,
             ) from None
         actions = self.answer(rows)
         return spaces.actions.value(actions[0]) if one else spaces.actions.values(actions)
