@@ -154,7 +154,7 @@ def test_a_calibration_takes_a_tenth_of_the_probes_at_most(rows):
 def test_a_law_that_is_mostly_at_its_bounds_has_its_derivative_between_them(gain):
     """At half of the states, at three quarters, at nearly nine of ten."""
     found = found_of(lambda x: np.clip(gain * x[:, :1], -1, 1))
-    assert (found.regime, found.radius) == ("smooth", 0.3)
+    assert (found.regime, found.radius, found.stencil) == ("smooth", 0.3, "central")
 
 
 @pytest.mark.parametrize("depth", [2, 8])

@@ -282,9 +282,9 @@ def _answered(
 def _similarity(wide: np.ndarray, narrow: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Return the mean over moving rays of 2 <a, b> / (|a|^2 + |b|^2), and the share that moves.
 
-    One number of each for each radius. Rays along which nothing changes say nothing: a law that is at a bound at most of its states
-    has its derivative at the others. Where nearly all of them are still, as near the states of a
-    tree, it is 0.
+    One number of each for each radius. Rays along which nothing changes say nothing: a law that
+    is at a bound at most of its states has its derivative at the others. Where nearly all are
+    still, as near the states of a tree, the similarity is 0.
     """
     both = (wide**2).sum(axis=-1) + (narrow**2).sum(axis=-1)
     product = 2 * (wide * narrow).sum(axis=-1)
