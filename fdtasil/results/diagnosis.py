@@ -15,8 +15,8 @@ from fdtasil.results.stability import Stability
 __all__ = ["Diagnosis"]
 
 _STEPS = (
-    "the expert answers in steps, so it has no derivatives: near its states nothing changes, and "
-    "farther away differences are of its jumps"
+    "the expert answers in steps, or is nearly always at a bound: no derivatives were found near "
+    "its states, and differences are of its jumps"
 )
 
 
