@@ -49,6 +49,9 @@ _COHERENT = 0.75
 # over both sides teaches better. Networks have 0.70 to 0.94, a bang-bang law and a sampling
 # controller, which are smooth at most states, 0.5, trees and int8 less.
 _ROUGH = 0.62
+# Share of rays along which something changes at that radius, below which the law is at a bound at
+# some of its states: there its kinks are near the others, and both sides teach better too.
+_ALL_MOVE = 0.9
 _ROUGH_RADIUS = 0.5
 # Change of the actions at the radius, beside how they vary over the states, above which the law is
 # steep for the scale that it is probed at: a swing-up that ends in a stiff balance has 2.4,
@@ -305,6 +308,8 @@ def _judge(
     low = float(radii[coherent[0]])
     regime = "noisy" if coherent[0] > 0 and low > _NOISY_FROM else "smooth"
     radius = max(usual, low)
-    # Where many rays are still, a kink is near the others: both sides teach better there too.
-    here = float(np.interp(np.log(radius), np.log(radii), similarity * moving))
-    return regime, radius, "central" if regime == "noisy" or here < _ROUGH else "forward"
+    coherence, share = (
+        float(np.interp(np.log(radius), np.log(radii), values)) for values in (similarity, moving)
+    )
+    kinked = coherence < _ROUGH or share < _ALL_MOVE
+    return regime, radius, "central" if regime == "noisy" or kinked else "forward"
