@@ -124,7 +124,7 @@ def read_agent(
         read_size(archive.record, f"{kind}_space", str(path)) for kind in ("observation", "action")
     )
     given = given_bounds(action_low, action_high, m)
-    statistics, statistics_sha256 = read_statistics(path, vecnormalize, n, trust)
+    statistics, statistics_sha256 = read_statistics(archive, vecnormalize, n, trust)
     if is_recurrent(archive.record):
         before = nn.Identity() if statistics is None else Normalise(statistics)
         module, bounds = _recurrent(archive, (n, m), given, before)

@@ -19,6 +19,9 @@ def normaliser_of(source: Any) -> Any:
     """
     if not hasattr(source, "get_vec_normalize_env"):
         return None
+    if source.env is None:
+        _check_forgotten(source)
+        return None
     found = None
     for layer in _layers(source.env):
         kind = type(layer).__name__
@@ -33,6 +36,20 @@ def normaliser_of(source: Any) -> Any:
             found = layer
     _check_innermost(source)
     return found
+
+
+def _check_forgotten(source: Any) -> None:
+    """Warn of an agent that was loaded without the VecNormalize that it was trained in.
+
+    Only PPO and its like, which alone have a gae_lambda, say so: see `statistics.py`.
+    """
+    kind = type(source).__name__
+    if hasattr(source, "gae_lambda") and source._last_original_obs is not None:
+        warn(
+            f"the {kind} agent was trained in VecNormalize, and has been loaded without it: if it "
+            "normalised observations, the agent is asked about others than it knows. Load it "
+            f"with its environment, as {kind}.load(path, env=VecNormalize.load('stats.pkl', venv))"
+        )
 
 
 def _layers(outermost: Any) -> Iterator[Any]:
