@@ -83,10 +83,38 @@ def test_an_agent_brings_its_vecnormalize():
 
 @pytest.mark.fault(150)
 def test_an_agent_of_other_wrappers_is_refused():
-    from stable_baselines3.common.vec_env import VecFrameStack
+    from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 
-    agent, _ = trained_in(partial(VecFrameStack, n_stack=3))
-    assert "VecFrameStack makes" in error_of(agent, 3, 1).found
+    stacked = partial(VecFrameStack, n_stack=3)
+    agent, _ = trained_in(stacked)
+    error = error_of(agent, 9, 1)
+    assert "VecFrameStack makes" in error.found
+    assert error.next_step.endswith("and pass agent.policy")
+    error = error_of(trained_in(VecNormalize, stacked)[0], 9, 1)
+    assert "VecNormalize does" in error.next_step
+    assert error.next_step.endswith("and pass agent.policy")
+
+
+@pytest.mark.fault(283)
+def test_the_advice_to_an_agent_of_stacked_frames_keeps_its_vecnormalize():
+    from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
+
+    agent, environments = trained_in(partial(VecFrameStack, n_stack=3), VecNormalize)
+    environments.seed(0)
+    environments.reset()
+    statistics = environments.obs_rms
+    statistics.mean, statistics.var = np.linspace(-1, 1, 9), np.linspace(0.1, 9, 9)
+    error = error_of(agent, 9, 1)
+    single = gymnasium.wrappers.FrameStackObservation(
+        gymnasium.make("Pendulum-v1"), 3, padding_type="zero"
+    )
+    single = gymnasium.wrappers.FlattenObservation(single)
+    row = environments.get_original_obs()
+    assert single.reset(seed=0)[0] == pytest.approx(row[0])
+    expected = predict(agent, environments.normalize_obs(row))
+    asks = evaluated(error, agent=agent)
+    assert asks(row) == pytest.approx(expected, abs=1e-6)
+    assert not np.allclose(predict(agent, row), expected)
 
 
 # --- batches and time

@@ -29,13 +29,31 @@ def normaliser_of(source: Any) -> Any:
             raise ExpertError(
                 f"the {type(source).__name__} agent was trained on observations that {kind} makes",
                 "an agent that takes the environment's own observations",
-                "do in the environment what the wrapper does (for VecFrameStack "
-                "FrameStackObservation and FlattenObservation), and pass agent.policy",
+                _advice(layer, normalised=found is not None),
             )
-        if kind == "VecNormalize" and layer.norm_obs:
+        if _normalises(layer):
             found = layer
     _check_innermost(source)
     return found
+
+
+def _normalises(layer: Any) -> bool:
+    return type(layer).__name__ == "VecNormalize" and layer.norm_obs
+
+
+def _advice(wrapper: Any, *, normalised: bool) -> str:
+    """Say how to do without a wrapper, and with the VecNormalize around it or inside it."""
+    inside = any(map(_normalises, _layers(wrapper.venv)))
+    first = "what VecNormalize does (TransformObservation with its normalize_obs), then "
+    asked = (
+        "a function: lambda rows: agent.predict("
+        "agent.get_vec_normalize_env().normalize_obs(rows), deterministic=True)[0]"
+    )
+    return (
+        f"do in the environment {first * inside}what the wrapper does (for VecFrameStack "
+        'FrameStackObservation with padding_type="zero", and FlattenObservation), and pass '
+        f"{asked if normalised else 'agent.policy'}"
+    )
 
 
 def _check_forgotten(source: Any) -> None:
