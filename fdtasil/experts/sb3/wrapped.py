@@ -7,8 +7,9 @@ from fdtasil.errors import ExpertError, warn
 
 __all__ = ["normaliser_of"]
 
-# Wrappers of vectorised environments that leave observations and actions as they are.
-_HARMLESS = {"VecMonitor", "VecCheckNan", "VecVideoRecorder", "VecNormalize"}
+# Wrappers of vectorised environments that leave observations and actions as they are, or do to
+# images what `predict` does to them itself.
+_HARMLESS = {"VecMonitor", "VecCheckNan", "VecVideoRecorder", "VecNormalize", "VecTransposeImage"}
 
 
 def normaliser_of(source: Any) -> Any:
