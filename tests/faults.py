@@ -301,6 +301,7 @@ FAULTS = {
         279: "bounds, or ends of episodes, that are not those of the arrays",
         282: "an action with one bound, which an exported student passes",
         270: "trust that does not reach the policy that asks for it",
+        283: "an agent whose VecNormalize is lost, or applied twice",
     },
 }
 

@@ -5,7 +5,10 @@ import numpy as np
 import pytest
 import torch
 from conftest import GAIN, QUICK, TOY, mlp_onnx
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import DummyVecEnv
 from test_memory import Remembers
+from toy_forms import InForm, in_form
 
 import fdtasil
 from fdtasil.errors import SettingError
@@ -72,6 +75,29 @@ def test_where_it_runs_it_keeps_its_own_past(file, tmp_path):
     judged = fdtasil.evaluate(result, file, TOY, episodes=2, horizon=20, progress=False)
     assert judged.student_return == pytest.approx(again.student_return, rel=1e-3)
     assert again.student_return == pytest.approx(result.evaluation.student_return, rel=1e-3)
+
+
+@pytest.mark.parametrize("done", ["box", "choices"])
+def test_stable_baselines3_evaluates_it_in_one_environment(done):
+    made = lambda: gymnasium.wrappers.TimeLimit(InForm("box", done), 20)  # noqa: E731
+    result = fdtasil.distill(in_form(linear_here, "box", done), made, 0, **RUN)
+    policy, alone, returns = fdtasil.History(result.student, H), made(), []
+    one, two = (DummyVecEnv([made] * count) for count in (1, 2))
+    one.seed(3)
+    for episode in range(2):
+        observation, _ = alone.reset(seed=None if episode else 3)
+        begun, over, total = True, False, 0.0
+        while not over:
+            action, _ = policy.predict(observation, episode_start=begun)
+            observation, reward, ended, late, _ = alone.step(action)
+            begun, over, total = False, ended or late, total + reward
+        returns.append(total)
+    mean, _ = evaluate_policy(policy, one, n_eval_episodes=2, warn=False)
+    assert mean == pytest.approx(np.mean(returns), rel=1e-5)
+    action, _ = policy.predict(np.zeros((1, N)), episode_start=np.array([True]))
+    assert action.shape == (1, M)
+    with pytest.raises(SettingError, match="n_envs=1"):
+        evaluate_policy(policy, two, n_eval_episodes=2, warn=False)
 
 
 def test_beside_a_memory_it_is_seen_and_the_memory_is_not(tmp_path):

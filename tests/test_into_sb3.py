@@ -1,9 +1,11 @@
 """A student goes on as an agent of stable-baselines3: the same answers before the first step."""
 
+import gymnasium
 import numpy as np
 import pytest
 from conftest import GAIN, QUICK, TOY
 from sb3_agents import seeded
+from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
 from toy_forms import InForm, in_form
 
 import fdtasil
@@ -38,7 +40,7 @@ def test_it_learns_on():
     assert again.evaluation is not None
 
 
-@pytest.mark.parametrize("done", ["choice", "choices"])
+@pytest.mark.parametrize("done", ["choices", "flags"])
 def test_choices_go_on_with_ppo(done):
     made = lambda: InForm("box", done)  # noqa: E731
     result = fdtasil.distill(in_form(law, "box", done), made, 0, **QUICK)
@@ -46,8 +48,48 @@ def test_choices_go_on_with_ppo(done):
     rows = result.demonstrations.observations
     chosen = agent.predict(rows, deterministic=True)[0]
     expected = result.student.predict(rows)[0]
-    first = int(done == "choice")  # of this space, which stable-baselines3 counts from 0
-    assert np.array_equal(chosen + first, expected)
+    assert np.array_equal(chosen, expected)
+    assert len(np.unique(expected)) > 1
+
+
+@pytest.mark.parametrize("done", ["choice", "shifted"])
+def test_choices_that_do_not_begin_at_0_go_on_as_the_refusal_says(done):
+    """Of choices stable-baselines3 knows no start: it would act by others."""
+    made = lambda: InForm("box", done)  # noqa: E731
+    result, env = fdtasil.distill(in_form(law, "box", done), made, 0, **QUICK), made()
+    with pytest.raises(ExportError, match="counts from 0") as caught:
+        result.to_sb3(env, "PPO")
+    code = caught.value.next_step.removeprefix("pass ")
+    agent = result.to_sb3(eval(code, {"gymnasium": gymnasium, "env": env}), "PPO")
+    rows = result.demonstrations.observations
+    chosen = agent.predict(rows, deterministic=True)[0] + env.action_space.start
+    assert np.array_equal(chosen, result.student.predict(rows)[0])
+    inside = agent.get_env()
+    inside.step(agent.predict(inside.reset(), deterministic=True)[0])  # it looks at its actions
+
+
+@pytest.mark.parametrize("algorithm", ["SAC", "TD3"])
+def test_actions_of_several_axes_go_on(algorithm):
+    made = lambda: InForm("box", "column")  # noqa: E731
+    result = fdtasil.distill(in_form(law, "box", "column"), made, 0, **QUICK)
+    agent = result.to_sb3(made(), algorithm)
+    rows = result.demonstrations.observations
+    expected = result.student.predict(rows)[0]
+    assert expected.shape == (len(rows), 2, 1)
+    assert agent.predict(rows, deterministic=True)[0] == pytest.approx(expected, abs=1e-5)
+
+
+@pytest.mark.fault(283)
+def test_observations_are_not_normalised_twice():
+    result = fdtasil.distill(law, TOY, 0, **QUICK)
+    inside = DummyVecEnv([InForm])
+    with pytest.raises(ExportError, match="in VecNormalize") as caught:
+        result.to_sb3(VecMonitor(VecNormalize(inside)), "SAC")
+    assert ".venv" in caught.value.next_step
+    for env in (inside, VecNormalize(inside, norm_obs=False)):
+        agent, rows = result.to_sb3(env, "SAC"), result.demonstrations.observations
+        expected = result.student.predict(rows)[0]
+        assert agent.predict(rows, deterministic=True)[0] == pytest.approx(expected, abs=1e-5)
 
 
 def test_what_is_no_actor_is_refused():
@@ -70,6 +112,11 @@ def test_another_environment_is_refused():
     for other in ("Nope-v1", "CartPole-v1"):
         with pytest.raises(ExportError, match="makes no SAC"):
             result.to_sb3(other, "SAC")
+    chosen = fdtasil.distill(
+        in_form(law, "box", "choices"), lambda: InForm("box", "choices"), 0, **QUICK
+    )
+    with pytest.raises(ExportError, match=r"among \(2, 2\)"):
+        chosen.to_sb3(InForm("box", "choice"), "PPO")  # as many scores
     some = fdtasil.distill(law, TOY, 0, student_obs=[0, 1], **QUICK)
     with pytest.raises(ExportError, match="whole observation"):
         some.to_sb3(InForm(), "SAC")

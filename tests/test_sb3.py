@@ -196,6 +196,25 @@ def test_an_agent_in_memory_is_not_a_zip(tmp_path):
     assert "agent.save(" in caught.value.next_step
 
 
+class Answers(torch.nn.Module):
+    """Says three things when it is called, and an action when it is asked."""
+
+    def forward(self, rows):
+        return rows[:, :1], rows.sum(1, keepdim=True), rows.sum(1)
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        return 2 * observation[:, :1], None
+
+
+@pytest.mark.parametrize("name", ["PPO", "A2C", "own"])
+def test_a_module_that_says_more_than_actions_is_asked_by_predict(name):
+    policy = Answers() if name == "own" else make_agent(name).policy
+    states = np.random.default_rng(0).standard_normal((40, 3)).astype(np.float32)
+    expected = policy.predict(states, deterministic=True)[0]
+    found = fdtasil.load_expert(policy, 3, 1).ask(states, "act")
+    assert np.abs(found - expected).max() <= 1e-5
+
+
 def test_distill_takes_the_zip(save):
     agent = make_agent("SAC")
     source = save(agent)

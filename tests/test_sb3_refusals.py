@@ -65,6 +65,9 @@ HOPELESS = {
     "dictionaries": policy_class(
         "stable_baselines3.common.policies", "MultiInputActorCriticPolicy"
     ),
+    "memory on images": policy_class(
+        "sb3_contrib.common.recurrent.policies", "RecurrentActorCriticCnnPolicy"
+    ),
     r"sbx, .*JAX.*\(sbx\.sac": policy_class("sbx.sac.policies", "SACPolicy"),
     "stable-baselines 2, of TensorFlow": lambda data: data.update(
         policy=data.pop("policy_class") | {"__module__": "stable_baselines.sac.policies"}

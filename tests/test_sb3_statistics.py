@@ -7,18 +7,21 @@ import gymnasium
 import numpy as np
 import pytest
 from sb3_agents import (
+    OFF_POLICY,
+    algorithm_class,
     answers,
     booby_trap,
     make_agent,
     predict,
     save_agent,
     save_old_statistics,
+    seeded,
     states_for,
 )
 from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import fdtasil
-from fdtasil.errors import ExpertError, SettingError
+from fdtasil.errors import ExpertError, FdtasilWarning, SettingError
 from fdtasil.experts.sb3.agent import read_agent
 from fdtasil.experts.sb3.export import export_sb3
 from fdtasil.files.onnx.model import read_model
@@ -142,3 +145,52 @@ def test_the_statistics_of_the_same_step_are_named_first(save, tmp_path):
 def test_statistics_of_other_agents_below_do_not_matter(plain, tmp_path):
     touch(tmp_path, ["another/vecnormalize.pkl", "another/vec_normalize.pkl"])
     read_agent(plain)
+
+
+def learnt(name, wrap):
+    """An agent that has learnt for a moment, since only then its zip says what it saw."""
+    few = {"buffer_size": 10, "learning_starts": 20} if name in OFF_POLICY else {"n_steps": 8}
+    few |= {"batch_size": 8} if name in ("PPO", "TRPO") else {}
+    environments = wrap(DummyVecEnv([lambda: gymnasium.make("Pendulum-v1")]))
+    with seeded():
+        return algorithm_class(name)("MlpPolicy", environments, device="cpu", **few).learn(8)
+
+
+@pytest.mark.fault(283)
+@pytest.mark.parametrize("name", ["PPO", "A2C", "TRPO"])
+def test_a_zip_that_says_that_it_was_normalised_is_warned_of(name, save, tmp_path):
+    agent = learnt(name, VecNormalize)
+    source = save(agent)
+    for ask in (read_agent, fdtasil.load_expert):
+        with pytest.warns(FdtasilWarning, match=r"agent\.zip was trained in VecNormalize") as said:
+            ask(source)
+        assert f"fdtasil export-sb3 {source} --out agent.onnx --vecnorm" in str(said[0].message)
+    assert read_agent(source, vecnormalize=False).statistics_sha256 is None
+    # The two ways that it names.
+    environments, states = agent.get_env(), states_for(agent)
+    environments.save(tmp_path / "stats.pkl")
+    expected = predict(agent, environments.normalize_obs(states))
+    read = read_agent(source, vecnormalize=tmp_path / "stats.pkl", trust="pickle")
+    assert np.abs(answers(read, states) - expected).max() <= 1e-5
+    wrapped = VecNormalize.load(tmp_path / "stats.pkl", environments.venv)
+    with seeded():
+        whole = type(agent).load(source, env=wrapped, device="cpu")
+        alone = type(agent).load(source, device="cpu")
+    found = fdtasil.load_expert(whole, 3, 1).ask(states, "act")
+    assert np.abs(found - expected).max() <= 1e-5
+    with pytest.warns(FdtasilWarning, match=f"{name} agent was trained in VecNormalize"):
+        fdtasil.load_expert(alone, 3, 1)
+
+
+@pytest.mark.fault(283)
+@pytest.mark.parametrize("name", ["PPO", "A2C", "TRPO", "SAC", "TD3"])
+def test_a_zip_that_does_not_say_so_is_not_warned_of(name, save):
+    """Warnings are errors here: SAC and TD3 keep an observation in each case."""
+    wrappers = (lambda one: one, VecNormalize) if name in ("SAC", "TD3") else (lambda one: one,)
+    for wrap in wrappers:
+        agent = learnt(name, wrap)
+        read_agent(save(agent))
+        with seeded():
+            loaded = type(agent).load(save(agent), device="cpu")
+        fdtasil.load_expert(loaded, 3, 1)
+    read_agent(save(make_agent(name)))

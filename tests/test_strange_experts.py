@@ -28,6 +28,7 @@ import fdtasil
 from fdtasil.errors import ExpertError, FdtasilWarning, first_line, shown, without_secrets
 from fdtasil.experts import http_expert, trial
 from fdtasil.experts.sizes import size_hint
+from fdtasil.rollouts.spaces import layout_of
 from fdtasil.student.view import View
 from fdtasil.testing import check_expert
 
@@ -83,10 +84,38 @@ def test_an_agent_brings_its_vecnormalize():
 
 @pytest.mark.fault(150)
 def test_an_agent_of_other_wrappers_is_refused():
-    from stable_baselines3.common.vec_env import VecFrameStack
+    from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
 
-    agent, _ = trained_in(partial(VecFrameStack, n_stack=3))
-    assert "VecFrameStack makes" in error_of(agent, 3, 1).found
+    stacked = partial(VecFrameStack, n_stack=3)
+    agent, _ = trained_in(stacked)
+    error = error_of(agent, 9, 1)
+    assert "VecFrameStack makes" in error.found
+    assert error.next_step.endswith("and pass agent.policy")
+    error = error_of(trained_in(VecNormalize, stacked)[0], 9, 1)
+    assert "VecNormalize does" in error.next_step
+    assert error.next_step.endswith("and pass agent.policy")
+
+
+@pytest.mark.fault(283)
+def test_the_advice_to_an_agent_of_stacked_frames_keeps_its_vecnormalize():
+    from stable_baselines3.common.vec_env import VecFrameStack, VecNormalize
+
+    agent, environments = trained_in(partial(VecFrameStack, n_stack=3), VecNormalize)
+    environments.seed(0)
+    environments.reset()
+    statistics = environments.obs_rms
+    statistics.mean, statistics.var = np.linspace(-1, 1, 9), np.linspace(0.1, 9, 9)
+    error = error_of(agent, 9, 1)
+    single = gymnasium.wrappers.FrameStackObservation(
+        gymnasium.make("Pendulum-v1"), 3, padding_type="zero"
+    )
+    single = gymnasium.wrappers.FlattenObservation(single)
+    row = environments.get_original_obs()
+    assert single.reset(seed=0)[0] == pytest.approx(row[0])
+    expected = predict(agent, environments.normalize_obs(row))
+    asks = evaluated(error, agent=agent)
+    assert asks(row) == pytest.approx(expected, abs=1e-6)
+    assert not np.allclose(predict(agent, row), expected)
 
 
 # --- batches and time
@@ -554,22 +583,57 @@ class Spaces(gymnasium.Env):
     action_space = gymnasium.spaces.Box(-1, 1, (2,), np.float32)
 
     def reset(self, *, seed=None, options=None):
-        return self.observation_space.sample(), {}
+        super().reset(seed=seed)
+        return self._drawn(), {}
 
     def step(self, action):
-        return self.observation_space.sample(), 0.0, False, False, {}
+        return self._drawn(), 0.0, False, False, {}
+
+    def _drawn(self):
+        self.observation_space.seed(int(self.np_random.integers(2**31)))
+        return self.observation_space.sample()
+
+
+class Pictures(Spaces):
+    observation_space = gymnasium.spaces.Box(0, 255, (36, 36, 3), np.uint8)
+
+
+class Square(Spaces):
+    observation_space = gymnasium.spaces.Box(-1, 1, (2, 2), np.float32)
+    action_space = gymnasium.spaces.MultiBinary(2)
+
+
+NOT_READ = {
+    "MultiInputPolicy": (Spaces, "dictionaries", {}),
+    "CnnPolicy": (Pictures, "images", {"probes": 0}),
+    "MlpPolicy": (Square, r"of shape \[2, 2\]", {}),
+}
 
 
 @pytest.mark.fault(163)
-def test_an_agent_of_dictionaries_works_as_its_error_says(tmp_path, rows):
+@pytest.mark.filterwarnings("ignore::fdtasil.errors.FdtasilWarning")  # rewards are all zero
+@pytest.mark.parametrize("policy", NOT_READ)
+def test_an_agent_that_is_not_read_is_asked_as_its_error_says(policy, tmp_path):
     from stable_baselines3 import PPO
 
+    environment, reason, options = NOT_READ[policy]
     with seeded():
-        agent = PPO("MultiInputPolicy", Spaces(), device="cpu")
-    error = error_of(save_agent(tmp_path, agent))
-    assert "dictionaries" in error.found
-    expert = fdtasil.load_expert(evaluated(error, agent=agent), 5, 2)
-    assert expert.ask(rows, "act").shape == (40, 2)
+        path = save_agent(tmp_path, PPO(policy, environment(), device="cpu"))
+        agent = PPO.load(path, device="cpu")
+        trained = PPO(policy, environment(), device="cpu")  # still in its environment
+    error = error_of(path)
+    assert re.search(reason, error.found)
+    step = "load it with its own library, and pass the agent itself: distill(agent, env)"
+    assert error.next_step == step + " with probes=0" * bool(options)
+    for one in (agent, trained):
+        result = fdtasil.distill(one, environment, **options, **{**QUICK, "horizon": 5})
+        states = result.demonstrations.observations
+        layout = layout_of(environment.observation_space, "observations")
+        expected = one.predict(layout.values(states), deterministic=True)[0]
+        found = result.demonstrations.actions
+        if policy == "MlpPolicy":  # scores of no and yes
+            found = found[:, 1::2] > found[:, ::2]
+        assert found == pytest.approx(expected, abs=1e-5)
 
 
 @pytest.mark.fault(164)

@@ -89,6 +89,14 @@ ACTIONS = {
     "choices": Form(
         MultiDiscrete([2, 2]), lambda u: (u > 0).astype(int), lambda u: 2.0 * np.asarray(u) - 1
     ),
+    "flags": Form(
+        MultiBinary(2), lambda u: (u > 0).astype(np.int8), lambda u: 2.0 * np.asarray(u) - 1
+    ),
+    "shifted": Form(
+        MultiDiscrete([2, 2], start=[3, 5]),
+        lambda u: (u > 0) + np.array([3, 5]),
+        lambda u: 2.0 * (np.asarray(u) - [3, 5]) - 1,
+    ),
 }
 
 

@@ -26,6 +26,7 @@ from fdtasil.experts.own_jacobian import own_jacobian
 from fdtasil.experts.picking import Picks, PicksOutput
 from fdtasil.experts.predicting import open_predictor
 from fdtasil.experts.sb3.agent import read_agent
+from fdtasil.experts.sb3.randomness import randomness_kept
 from fdtasil.experts.sb3.recurrent import RecurrentNetwork
 from fdtasil.experts.sb3.trust import Trust
 from fdtasil.experts.silence import Silence
@@ -317,11 +318,14 @@ def _is_the_policy(module: torch.nn.Module, observation_size: int | None) -> boo
         return False
     rows = np.random.default_rng(0).standard_normal((8, observation_size)).astype(np.float32)
     try:
-        called = open_module(module).answer(rows.copy())
-        asked = open_predictor(module).answer(rows.copy())
+        with randomness_kept():  # calling PPO's draws an action
+            called = open_module(module).answer(rows.copy())
+        asked = np.asarray(open_predictor(module).answer(rows.copy()))
     except (AttributeError, LookupError, RuntimeError, TypeError, ValueError):
         return False
-    return np.shape(called) == np.shape(asked) and np.allclose(called, asked, atol=1e-5)
+    if not isinstance(called, np.ndarray):  # PPO's says actions, values and log-probabilities
+        return False
+    return called.shape == asked.shape and np.allclose(called, asked, atol=1e-5)
 
 
 def _from_predictor(source: Predictor, hints: Hints) -> Expert:

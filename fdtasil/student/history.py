@@ -18,7 +18,7 @@ class History:
         history: H, as in that call.
 
     Raises:
-        SettingError: If the student was trained with another.
+        SettingError: If the student was trained with another, as far as sizes tell.
 
     Example:
         >>> import numpy as np
@@ -51,10 +51,13 @@ class History:
         self,
         observation: np.ndarray,
         state: None = None,
-        episode_start: bool = False,
+        episode_start: bool | np.ndarray = False,
         deterministic: bool = True,
     ) -> tuple[np.ndarray, None]:
         """Answer one observation (n,), and remember it.
+
+        A vector environment of one is answered too, as stable-baselines3 asks: an observation
+        (1, n) and an episode_start (1,) with one action (1, m).
 
         Raises:
             SettingError: If it has another shape.
@@ -65,7 +68,14 @@ class History:
             episode_start: Whether an episode begins, before which there is nothing.
             deterministic: Not used; the student always is.
         """
-        if episode_start:
+        episodes = np.shape(episode_start)
+        if episodes not in ((), (1,)):
+            raise SettingError(
+                f"episode_start of shape {episodes}",
+                "one episode, which a History follows",
+                "make the vector environment with n_envs=1",
+            )
+        if np.any(episode_start):
             self._window.clear()
         n = self.observation_size
         try:
@@ -76,16 +86,20 @@ class History:
                 f"({n},), its flat form",
                 "pass result.dataset.spaces.observations.row(observation)",
             ) from error
+        together = episodes == (1,) and seen.shape == (1, n)
+        seen = seen[0] if together else seen
         if seen.shape != (n,):
             raise SettingError(
                 f"an observation of shape {seen.shape}",
                 f"({n},), one observation of a history of {self._history}",
-                "pass the environment's own; another history would ask for another size",
+                "pass the environment's own, of a vector environment of one with its "
+                "episode_start; another history would ask for another size",
             )
         rows = self._window.behind(seen)[None].astype(np.float32)
         action, spaces = self._student.answer(rows)[0], self._student.spaces
         if spaces is None:
             self._window.push(seen, action)
-            return action, None
+            return action[None] if together else action, None
         self._window.push(seen, spaces.actions.done(action))
-        return spaces.actions.value(action), None
+        actions = spaces.actions
+        return actions.values(action[None]) if together else actions.value(action), None

@@ -8,8 +8,9 @@ import torch
 from torch import nn
 
 from fdtasil.checks import check_choice, check_count
-from fdtasil.errors import ExportError, first_line
+from fdtasil.errors import ExportError, first_line, shown
 from fdtasil.experts.sb3.randomness import randomness_kept
+from fdtasil.rollouts.spaces import layout_of
 from fdtasil.student.architectures import ACTIVATIONS, Mlp
 from fdtasil.student.policy import Student
 
@@ -81,10 +82,14 @@ def agent_of(student: Student, env: Any, algorithm: str, seed: int) -> Any:
     except Exception as error:  # of gymnasium, or of the library
         raise ExportError(
             f"stable-baselines3 makes no {algorithm} in this environment: {first_line(error)}",
-            "the environment that the student was trained in",
-            "pass its id, or the environment itself",
+            "the environment that the student was trained in, with actions that the library takes",
+            "pass its id, or the environment itself, in a wrapper that flattens its actions",
         ) from error
+    _check_normaliser(agent)
     _check_spaces(student, agent, choices)
+    if type(agent.action_space).__name__ == "MultiBinary":  # a logit of yes, for no and yes
+        weight, bias = layers[-1]
+        layers[-1] = weight[1::2] - weight[::2], bias[1::2] - bias[::2]
     pairs = list(zip(layers_of(agent.policy), layers, strict=True))
     if any(mine.weight.shape != weight.shape for mine, (weight, _) in pairs):
         raise ExportError(
@@ -102,13 +107,24 @@ def agent_of(student: Student, env: Any, algorithm: str, seed: int) -> Any:
     return agent
 
 
+def _check_normaliser(agent: Any) -> None:
+    """Refuse to normalise observations twice."""
+    around = agent.get_vec_normalize_env()
+    if around is not None and around.norm_obs:
+        raise ExportError(
+            "an environment in VecNormalize, which normalises what the student normalises itself",
+            "one that gives its own observations",
+            "pass it without VecNormalize (its .venv), or with norm_obs=False for rewards alone",
+        )
+
+
 def _check_spaces(student: Student, agent: Any, choices: bool) -> None:
     """Refuse an environment whose actions mean something else."""
+    space = agent.action_space
     if choices:
+        _check_choices(student, space)
         return
-    low, high = (
-        np.asarray(end, np.float32) for end in (agent.action_space.low, agent.action_space.high)
-    )
+    low, high = (np.asarray(end, np.float32).ravel() for end in (space.low, space.high))
     ours = student.low.numpy(), student.high.numpy()
     if low.shape == ours[0].shape and np.allclose((low, high), ours, rtol=1e-5):
         return
@@ -117,6 +133,26 @@ def _check_spaces(student: Student, agent: Any, choices: bool) -> None:
         f"{low} to {high}, as the environment",
         "pass the environment that it was trained in",
     )
+
+
+def _check_choices(student: Student, space: Any) -> None:
+    """Refuse other choices, and those that do not begin at 0, which the library does not know."""
+    assert student.spaces is not None, "it has choices"
+    ours, (theirs,) = student.spaces.actions.parts, layout_of(space, "actions").parts
+    if [part.sizes for part in ours] != [theirs.sizes]:
+        raise ExportError(
+            f"a student of choices among {', '.join(str(part.sizes) for part in ours)}",
+            f"{theirs.sizes}, as the environment",
+            "pass the environment that it was trained in",
+        )
+    if any(theirs.first):
+        kind, sizes = type(space).__name__, "nvec" if hasattr(space, "nvec") else "n"
+        raise ExportError(
+            f"the actions {shown(space)}, which stable-baselines3 counts from 0",
+            "choices that begin at 0",
+            "pass gymnasium.wrappers.TransformAction(env, lambda action: action + "
+            f"env.action_space.start, gymnasium.spaces.{kind}(env.action_space.{sizes}))",
+        )
 
 
 def _folded(student: Student) -> Layers | None:

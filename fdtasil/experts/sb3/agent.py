@@ -32,7 +32,7 @@ from fdtasil.experts.sb3.spaces import (
     read_size,
 )
 from fdtasil.experts.sb3.statistics import VecNormalizePath, read_statistics
-from fdtasil.experts.sb3.trust import TRUST, Trust, check_trust
+from fdtasil.experts.sb3.trust import ITSELF, TRUST, Trust, check_trust
 from fdtasil.files.border import reads
 
 __all__ = ["Agent", "read_agent"]
@@ -124,7 +124,7 @@ def read_agent(
         read_size(archive.record, f"{kind}_space", str(path)) for kind in ("observation", "action")
     )
     given = given_bounds(action_low, action_high, m)
-    statistics, statistics_sha256 = read_statistics(path, vecnormalize, n, trust)
+    statistics, statistics_sha256 = read_statistics(archive, vecnormalize, n, trust)
     if is_recurrent(archive.record):
         before = nn.Identity() if statistics is None else Normalise(statistics)
         module, bounds = _recurrent(archive, (n, m), given, before)
@@ -183,8 +183,7 @@ def _read_network(
         return _rebuilt(archive, recipe, sizes, given)
     except ExpertError as refusal:
         if choice_sizes(archive.record) and refusal.next_step == TRUST:
-            step = "load it with its own library, and pass the agent itself: distill(agent, env)"
-            raise ExpertError(refusal.found, refusal.expected, step) from refusal
+            raise ExpertError(refusal.found, refusal.expected, ITSELF) from refusal
         if trust is None or refusal.next_step != TRUST:
             raise
     from fdtasil.experts.sb3.trusted import unpickle_agent
@@ -219,8 +218,7 @@ def _recurrent(
     except ExpertError as refusal:
         if refusal.next_step != TRUST:
             raise
-        step = "load it with its own library, and pass the agent itself: distill(agent, env)"
-        raise ExpertError(refusal.found, refusal.expected, step) from refusal
+        raise ExpertError(refusal.found, refusal.expected, ITSELF) from refusal
     lstm = read_lstm(weights, n, source)
     after = build_network(weights, RECURRENT, activation, (lstm.hidden_size, m), source)
     if choice_sizes(archive.record):

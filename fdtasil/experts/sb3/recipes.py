@@ -8,18 +8,15 @@ from typing import Any
 from torch import nn
 
 from fdtasil.errors import ExpertError, shown
-from fdtasil.experts.sb3.trust import TRUST
+from fdtasil.experts.sb3.trust import ITSELF, TRUST
 
 __all__ = [
-    "FLATTENED",
     "Recipe",
     "check_policy",
     "find_recipe",
     "has_usual_policy",
     "read_activation",
 ]
-
-_ITSELF = "load it with its own library, and pass the agent itself: distill(agent, env)"
 
 Record = Mapping[str, Any]
 
@@ -141,21 +138,18 @@ _HARMLESS = {
     *("enable_critic_lstm", "lstm_hidden_size", "n_lstm_layers", "shared_lstm"),
 }
 # Policies that are not read, trusted or not, and what to do instead.
-FLATTENED = (
-    "wrap the environment in FlattenObservation, and pass a function: lambda rows: np.stack("
-    "[agent.predict(gymnasium.spaces.unflatten(agent.observation_space, row), "
-    "deterministic=True)[0] for row in rows])"
-)
-_TRAIN = "choose or train such an agent; fdtasil distils no other"
 _UNFIT = {
-    r"(stable_baselines3|sb3_contrib)\..*Cnn": ("a policy on images", _TRAIN),
+    r"sb3_contrib\..*recurrent.*(Cnn|MultiInput)": (
+        "a policy with memory on images or dictionaries",
+        "choose or train an agent with memory on flat observations",
+    ),
+    r"(stable_baselines3|sb3_contrib)\..*Cnn": ("a policy on images", f"{ITSELF} with probes=0"),
     r"(stable_baselines3|sb3_contrib)\..*MultiInput": (
         "a policy on dictionaries of observations",
-        FLATTENED,
+        ITSELF,
     ),
-    r"sb3_contrib\..*recurrent.*(Cnn|MultiInput)": ("a policy with memory on images", _TRAIN),
-    r"sbx\.": ("a policy of sbx, whose weights are JAX's", _ITSELF),
-    r"stable_baselines\.": ("a policy of stable-baselines 2, of TensorFlow", _ITSELF),
+    r"sbx\.": ("a policy of sbx, whose weights are JAX's", ITSELF),
+    r"stable_baselines\.": ("a policy of stable-baselines 2, of TensorFlow", ITSELF),
 }
 
 
@@ -189,7 +183,7 @@ def find_recipe(record: Record, source: str) -> Recipe:
     raise ExpertError(
         f"{source} holds no agent of a known algorithm (its policy: {_policy_class(record)})",
         f"one of {', '.join(sorted(recipe.algorithm for recipe in RECIPES))}",
-        _ITSELF,
+        ITSELF,
     )
 
 

@@ -10,6 +10,7 @@ from torch import Tensor, nn
 
 from fdtasil.errors import ExpertError, shown
 from fdtasil.experts.sb3.recipes import Recipe
+from fdtasil.experts.sb3.trust import ITSELF
 
 __all__ = ["RECURRENT", "RecurrentNetwork", "is_recurrent", "read_lstm"]
 
@@ -69,7 +70,7 @@ def read_lstm(weights: Mapping[str, Tensor], size: int, source: str) -> nn.LSTM:
         raise ExpertError(
             shown(f"{source} has an LSTM of {', '.join(sorted(found)) or 'no weights'}"),
             f"a plain LSTM on {size} observations, one after the other if there are several",
-            "load it with its own library, and pass the agent itself: distill(agent, env)",
+            ITSELF,
         )
     lstm = nn.LSTM(size, hidden, layers, device="meta")
     for name in expected:

@@ -9,15 +9,12 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fdtasil.errors import ExpertError, SettingError, shown
+from fdtasil.experts.sb3.trust import ITSELF
 
 __all__ = ["Bounds", "choice_sizes", "given_bounds", "no_bounds", "read_bounds", "read_size"]
 
 _BOX = re.compile(r"<class '(?:gym|gymnasium)\.spaces\.box\.Box'>")
 _LARGEST = 10**6
-_ADVICE = {
-    "observation_space": "train on flat observations (gymnasium.wrappers.FlattenObservation)",
-    "action_space": "choose an agent of continuous or of discrete actions",
-}
 _CHOICE = re.compile(
     r"<class '(?:gym|gymnasium)\.spaces\.(?:multi_)?discrete\.(?:Multi)?Discrete'>"
 )
@@ -73,7 +70,7 @@ def read_size(record: Mapping[str, Any], name: str, source: str) -> int:
     raise ExpertError(
         shown(f"{source} has the {name} {kind} of shape {shape} and dtype {dtype}"),
         "a Box of floats with one dimension" + ", or choices" * (name == "action_space"),
-        _ADVICE[name],
+        ITSELF,
     )
 
 

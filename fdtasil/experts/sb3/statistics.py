@@ -8,8 +8,8 @@ from typing import Literal
 
 import numpy as np
 
-from fdtasil.errors import ExpertError, SettingError
-from fdtasil.experts.sb3.archive import read_file
+from fdtasil.errors import ExpertError, SettingError, warn
+from fdtasil.experts.sb3.archive import Archive, read_file
 from fdtasil.experts.sb3.network import ObservationStatistics
 from fdtasil.experts.sb3.trust import Trust
 from fdtasil.files.storage import sha256
@@ -20,12 +20,12 @@ VecNormalizePath = str | Path | Literal[False] | None
 
 
 def read_statistics(
-    agent: Path, given: VecNormalizePath, observation_size: int, trust: Trust
+    agent: Archive, given: VecNormalizePath, observation_size: int, trust: Trust
 ) -> tuple[ObservationStatistics | None, str | None]:
     """Read what an agent's observations are normalised with.
 
     Args:
-        agent: The zip, for a look at what lies beside it.
+        agent: The zip, for a look at what it says, and at what lies beside it.
         given: The file, False (or the word "False", as a shell says it) where there is none, or
             None where nothing was said.
         observation_size: n.
@@ -42,7 +42,8 @@ def read_statistics(
     if given in (False, "False"):
         return None, None
     if given is None:
-        _check_neighbours(agent)
+        _check_neighbours(agent.path)
+        _check_record(agent)
         return None, None
     if not isinstance(given, (str, Path)):
         raise SettingError(f"vecnormalize={given!r}", "a path, or False", "name the file")
@@ -71,13 +72,35 @@ def _check_neighbours(agent: Path) -> None:
     if not found:
         return
     more = f" (and {len(found) - 1} more)" if len(found) > 1 else ""
-    named, out, file = (shlex.quote(str(part)) for part in (agent, f"{agent.stem}.onnx", found[0]))
-    command = f"fdtasil export-sb3 {named} --out {out} --vecnormalize"
     raise ExpertError(
         f"{found[0]}{more} lies beside {agent.name} and looks like its observation statistics",
         "one ONNX file of both, or the word that the agent was trained without them",
-        f"{command} {file} --trust pickle (or --vecnormalize False), then use the ONNX file",
+        f"{_command(agent, found[0])} (or --vecnormalize False), then use the ONNX file",
     )
+
+
+def _check_record(agent: Archive) -> None:
+    """Warn of an agent that was trained in VecNormalize, whose statistics are not here.
+
+    PPO and its like, which alone have a gae_lambda, keep an observation of before the normalising
+    only where there is one; SAC, TD3 and DQN keep one always.
+    """
+    kept = agent.record.get("_last_original_obs")
+    kind = kept.get(":type:") if isinstance(kept, dict) else None
+    if "gae_lambda" not in agent.record or kind != "<class 'numpy.ndarray'>":
+        return
+    warn(
+        f"{agent.path} was trained in VecNormalize, and its statistics are not given: if it "
+        "normalised observations, the agent is asked about others than it knows. Pass the agent "
+        f"with its environment, as PPO.load({agent.path.name!r}, env=VecNormalize.load("
+        f"'stats.pkl', venv)), or write `{_command(agent.path, Path('stats.pkl'))}`, and use the "
+        "ONNX file (--vecnormalize False if it normalised rewards alone)"
+    )
+
+
+def _command(agent: Path, file: PurePath) -> str:
+    named, out, pkl = (shlex.quote(str(part)) for part in (agent, f"{agent.stem}.onnx", file))
+    return f"fdtasil export-sb3 {named} --out {out} --vecnormalize {pkl} --trust pickle"
 
 
 def statistics_beside(agent: PurePath, files: Collection[PurePath]) -> list[PurePath]:

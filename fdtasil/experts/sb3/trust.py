@@ -21,3 +21,4 @@ TRUST = (
     'if you trust its source, write load_expert(path, trust="pickle") (--trust pickle in a '
     "shell): that runs the code in the zip"
 )
+ITSELF = "load it with its own library, and pass the agent itself: distill(agent, env)"
