@@ -325,3 +325,16 @@ def test_choices_in_rows_keep_their_shape_in_the_file(tmp_path):
     (chosen,) = session.run(["actions"], {"obs": rows})
     assert chosen.shape == (5, 2, 2)
     assert np.array_equal(chosen, result.student.predict(rows)[0])
+
+
+@pytest.mark.filterwarnings("default::fdtasil.errors.FdtasilWarning")
+def test_recorded_choices_are_taken_as_the_error_says():
+    made, rows = lambda: InForm("box", "choice"), rows_of()
+    chosen, run = scores(rows).argmax(axis=1), {"probes": 0, "evaluation_episodes": 2}
+    run |= {"horizon": 10, "fit": fdtasil.Fit(steps=5), "student": fdtasil.Mlp(4)}
+    plain = fdtasil.from_arrays(rows, chosen[:, None].astype(np.float32))
+    with pytest.raises(SettingError) as caught:
+        fdtasil.distill(scores, made, dataset=plain, **run)
+    told = caught.value.next_step.partition("there: ")[2]
+    data = fdtasil.from_arrays(rows, eval(told, {"np": np, "chosen": chosen}))
+    assert fdtasil.distill(None, made, dataset=data, **run).student.action_size == 4

@@ -482,3 +482,25 @@ def test_many_rows_without_an_answer_are_none_where_others_have_one():
     answers = expert.ask(rows, "probe")
     assert np.isnan(answers[:80]).all()
     assert (answers[80:] == -1).all()
+
+
+def test_an_output_that_is_a_list_of_dictionaries_says_how_to_convert_it(tmp_path):
+    """A classifier of skl2onnx, as it is written if nothing is said."""
+    rows = helper.make_tensor_value_info("rows", TensorProto.FLOAT, ["batch", 3])
+    label = helper.make_tensor_value_info("label", TensorProto.INT64, ["batch", 1])
+    each = helper.make_map_type_proto(
+        TensorProto.INT64, helper.make_tensor_type_proto(TensorProto.FLOAT, [])
+    )
+    shares = helper.make_value_info("shares", helper.make_sequence_type_proto(each))
+    best = helper.make_node("ArgMax", ["rows"], ["label"], axis=1)
+    zipped = helper.make_node(
+        "ZipMap", ["rows"], ["shares"], domain="ai.onnx.ml", classlabels_int64s=[0, 1, 2]
+    )
+    graph = helper.make_graph([best, zipped], "classifier", [rows], [label, shares])
+    versions = [helper.make_opsetid("", 17), helper.make_opsetid("ai.onnx.ml", 1)]
+    model = helper.make_model(graph, opset_imports=versions, ir_version=8)
+    onnx.save(model, tmp_path / "classifier.onnx")
+    for output in (None, "shares"):
+        with pytest.raises(ExpertError) as caught:
+            fdtasil.load_expert(tmp_path / "classifier.onnx", 3, output=output)
+        assert '{"zipmap": False}' in caught.value.next_step

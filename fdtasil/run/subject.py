@@ -92,10 +92,13 @@ def open_subject(
             n, m = given.own_size, given.sizes[1]
             name, spaces = given.environment, given.spaces
         if given is not None and (found := (given.own_size, given.sizes[1])) != (n, m):
+            chosen = spaces is not None and len(spaces.actions.choices) == 1 and found[0] == n
             raise SettingError(
                 f"a dataset with (observations, actions) of sizes {found}",
                 f"{(n, m)}, as {name}",
-                "pass the environment that they were recorded in, or none",
+                f"actions that were chosen, from 0 on, are scores there: np.eye({m})[chosen] - 1 / {m}"
+                if chosen
+                else "pass the environment that they were recorded in, or none",
             )
         opened, past = None, past_size(history, n, m)
         remembered = given.remembered if given is not None else 0

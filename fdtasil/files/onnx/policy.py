@@ -240,16 +240,23 @@ def _wrapped(session: "Session", name: str, output: str, *parts: str) -> str:
     )
 
 
+_NO_LIST = 'a classifier of skl2onnx: convert it with options={id(model): {"zipmap": False}}'
+
+
 def _choose_output(
     session: "Session", name: str, action_size: int | None, output: str | None, choices: int
 ) -> str:
     outputs = session.get_outputs()
     described = _described(outputs)
     if output is not None:
-        if output not in [entry.name for entry in outputs]:
+        kinds = {entry.name: entry.type for entry in outputs}
+        if output not in kinds:
             raise ExpertError(
                 f"{name} has no output {output!r}", f"one of {described}", "choose one of these"
             )
+        if kinds[output].startswith("seq("):
+            found = f"the output {output!r} of {name} is a list ({shown(kinds[output])})"
+            raise ExpertError(found, "numbers (batch, m)", _NO_LIST)
         return output
     rank = len(session.get_inputs()[0].shape)
     fitting = [entry.name for entry in outputs if _could_be_actions(entry, rank, action_size)]
@@ -263,7 +270,7 @@ def _choose_output(
             f"one floating-point output (batch, {action_size or 'm'})",
             'name it: load_expert(path, output="...") (--output on the command line)'
             if fitting
-            else 'convert it with options={"zipmap": False}'
+            else _NO_LIST
             if any(entry.type.startswith("seq(") for entry in outputs)
             else "check that expert and environment belong together",
         )
