@@ -96,7 +96,7 @@ def open_subject(
             raise SettingError(
                 f"a dataset with (observations, actions) of sizes {found}",
                 f"{(n, m)}, as {name}",
-                f"actions that were chosen, from 0 on, are scores there: np.eye({m})[chosen] - 1 / {m}"
+                f"choices, from 0 on, are scores there: np.eye({m})[chosen] - 1 / {m}"
                 if chosen
                 else "pass the environment that they were recorded in, or none",
             )
