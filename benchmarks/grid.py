@@ -6,7 +6,7 @@ from typing import Any
 from benchmarks.controllers import available
 from benchmarks.runner import Cell
 
-__all__ = ["SEEDS", "STANDARD_METHODS", "experts", "label", "side_by_side"]
+__all__ = ["SEEDS", "STANDARD_METHODS", "every_expert", "experts", "label", "side_by_side"]
 
 SEEDS = range(5)
 ENVIRONMENTS = ("Walker2d", "HalfCheetah", "Ant", "Humanoid")
@@ -35,6 +35,19 @@ def experts() -> list[str]:
     """Return the paper's experts where they are, this project's otherwise."""
     here = available(*(f"paper/{name}" for name in ENVIRONMENTS))
     return here or available(*(f"{name}-v5" for name in ENVIRONMENTS))
+
+
+def every_expert(quick: bool) -> list[Cell]:
+    """Return a cell for every expert that moves on its own, and seed.
+
+    Args:
+        quick: Whether to take two seeds of one expert only.
+    """
+    return [
+        {"expert": expert, "seed": seed}
+        for seed in (SEEDS[:2] if quick else SEEDS)
+        for expert in (available("HalfCheetah-v5") if quick else available())
+    ]
 
 
 def side_by_side(

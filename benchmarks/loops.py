@@ -5,22 +5,13 @@ from statistics import median
 from typing import Any
 
 import fdtasil
-from benchmarks.controllers import CONTROLLERS, available
+from benchmarks.controllers import CONTROLLERS
 from benchmarks.distillation import HORIZON
-from benchmarks.grid import SEEDS
+from benchmarks.grid import every_expert
 from benchmarks.runner import Benchmark, Cell, Row
 from benchmarks.tables import table
 
 __all__ = ["BENCHMARK"]
-
-
-def cells(quick: bool) -> list[Cell]:
-    """Every expert and seed."""
-    return [
-        {"expert": expert, "seed": seed}
-        for seed in (SEEDS[:2] if quick else SEEDS)
-        for expert in (available("HalfCheetah-v5") if quick else available())
-    ]
 
 
 def run(cell: Cell, device: str) -> dict[str, Any]:
@@ -63,4 +54,4 @@ def _line(results: Sequence[dict[str, Any]]) -> list[str]:
     ]
 
 
-BENCHMARK = Benchmark("loops", __doc__ or "", cells, run, draw)
+BENCHMARK = Benchmark("loops", __doc__ or "", every_expert, run, draw)

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 import fdtasil
-from benchmarks.controllers import CONTROLLERS, available
+from benchmarks.controllers import CONTROLLERS
 from benchmarks.distillation import HORIZON
-from benchmarks.grid import SEEDS
+from benchmarks.grid import every_expert
 from benchmarks.panels import draw_panels
 from benchmarks.runner import Benchmark, Cell, Row
 from benchmarks.statistics import (
@@ -39,15 +39,6 @@ A student is the smallest whose interval over 20 episodes begins above {KEEP}. T
 chose it flatter it: it was judged once more, from others, and its C code from these too. All
 students were trained for {STEPS:,} steps.
 """
-
-
-def cells(quick: bool) -> list[Cell]:
-    """Every expert and seed."""
-    return [
-        {"expert": expert, "seed": seed}
-        for seed in (SEEDS[:2] if quick else SEEDS)
-        for expert in (available("HalfCheetah-v5") if quick else available())
-    ]
 
 
 def run(cell: Cell, device: str) -> dict[str, Any]:
@@ -194,4 +185,4 @@ def _curves(results: Sequence[Any]) -> dict[str, dict[float, list[float]]]:
     }
 
 
-BENCHMARK = Benchmark("small_students", __doc__ or "", cells, run, draw)
+BENCHMARK = Benchmark("small_students", __doc__ or "", every_expert, run, draw)

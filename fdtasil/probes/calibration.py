@@ -299,7 +299,7 @@ def _similarity(wide: np.ndarray, narrow: np.ndarray) -> tuple[np.ndarray, np.nd
 def _judge(
     similarity: np.ndarray, moving: np.ndarray, radii: np.ndarray, usual: float
 ) -> tuple[Literal["smooth", "noisy", "steps"], float, str]:
-    """Return regime, radius and stencil from what `_similarity` says of all radii but one."""
+    """Return regime, radius and stencil from what `_similarity` says of all but the smallest."""
     coherent = np.flatnonzero(similarity >= _COHERENT)
     if not len(coherent) or radii[coherent[-1]] < 1e-3:
         return "steps", max(usual, _ROUGH_RADIUS), "central"
