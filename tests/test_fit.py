@@ -1,5 +1,8 @@
 """Training: what a step costs, what it visits, when it asks."""
 
+import platform
+import subprocess
+import sys
 import time
 from dataclasses import replace
 
@@ -309,6 +312,35 @@ def test_torch_settings_are_put_back():
     finally:
         torch.set_num_threads(1)
         torch.set_float32_matmul_precision("highest")
+
+
+_LARGE_STEPS = """
+import resource, torch
+from fdtasil.compute import torch_settings
+
+states, layers = torch.randn(2_550, 17), [torch.nn.Linear(17, 512), torch.nn.Linear(512, 512)]
+network = torch.nn.Sequential(layers[0], torch.nn.GELU(), layers[1], torch.nn.GELU())
+
+def new_pages(steps):
+    before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt
+    for _ in range(steps):
+        network.zero_grad()
+        network(states).square().mean().backward()
+    return resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before
+
+with torch_settings(torch.device("cpu")):
+    print(new_pages(6), new_pages(10))
+"""
+
+
+@pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another allocator than glibc's")
+def test_a_step_takes_the_memory_that_the_last_one_freed():
+    """A system that gives new pages each time takes a third of a step with fifty probes."""
+    command = [sys.executable, "-c", _LARGE_STEPS]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    first, others = map(int, done.stdout.split())
+    assert first > 10_000
+    assert others < 10_000  # a tensor may move once; with new ones at every step, 40,000 and more
 
 
 @pytest.mark.fault(105)
