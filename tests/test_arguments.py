@@ -130,6 +130,7 @@ def test_what_can_only_mean_one_thing_is_taken():
         lambda: fdtasil.distill(linear, TOY, 0, student_obs=[True, False], **TINY),
         lambda: fdtasil.distill(linear, TOY, 0, student_obs=True, **TINY),
         lambda: fdtasil.distill(linear, TOY, 0, student_obs=[0, 5], **TINY),
+        lambda: fdtasil.distill(linear, TOY, 0, student_obs=[1, 0, 1], **TINY),
         lambda: fdtasil.distill(linear, TOY, 0, student_obs=["0"], **TINY),
     ],
 )

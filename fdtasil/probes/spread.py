@@ -64,7 +64,7 @@ class Spread:
             checked = sorted(
                 _checked(column, value, n)
                 for key, value in given.items()
-                for column in _columns(key, layout)
+                for column in _columns(key, value, layout)
             )
             if len(dict(checked)) < len(checked):
                 raise SettingError(
@@ -108,10 +108,10 @@ def _checked(coordinate: object, deviation: object, n: int) -> tuple[int, float]
         raise SettingError(f"spread: {error.found}", error.expected, _EXAMPLE) from None
 
 
-def _columns(key: object, layout: Layout | None) -> tuple[object, ...]:
+def _columns(key: object, value: object, layout: Layout | None) -> tuple[object, ...]:
     if not isinstance(key, str):
         return (key,)
-    return columns_named(key, layout, spelt("spread", {key: "..."}), _EXAMPLE)
+    return columns_named(key, layout, spelt("spread", {key: value}), _EXAMPLE)
 
 
 def _coordinate(text: str) -> int | str:

@@ -186,7 +186,7 @@ def _called(function: Callable[..., object]) -> str:
 
 
 def _indices(student_obs: object, n: int) -> tuple[int, ...]:
-    expected = f"indices from 0 to {n - 1}, at least one; {n} times True or False; or a function"
+    expected = f"some of the indices 0 to {n - 1}, each once; {n} times True or False; a function"
     columns: tuple[int, ...] = ()
     with suppress(TypeError, ValueError, OverflowError):
         mask = np.asarray(student_obs)
@@ -194,7 +194,9 @@ def _indices(student_obs: object, n: int) -> tuple[int, ...]:
             columns = tuple(operator.index(index) for index in student_obs)  # pyright: ignore
         elif mask.shape == (n,):
             columns = tuple(np.flatnonzero(mask).tolist())
-    if not columns or np.ma.is_masked(student_obs) or not all(0 <= i < n for i in columns):
+    distinct = len(set(columns)) == len(columns)
+    inside = bool(columns) and distinct and all(0 <= i < n for i in columns)
+    if not inside or np.ma.is_masked(student_obs):
         example = f"write for example student_obs=range({min(n, 10)})"
         raise SettingError(spelt("student_obs", student_obs), expected, example)
     return columns
