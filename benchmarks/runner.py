@@ -259,7 +259,11 @@ def _machine(device: str) -> str:
 
 
 def _commit() -> str | None:
-    asked = subprocess.run(
-        ["git", "describe", "--always", "--dirty"], cwd=HERE, capture_output=True, text=True
-    )
-    return asked.stdout.strip() or None
+    """Return the commit of the code, "-dirty" where that was changed; rows are no code."""
+    commit = _git("describe", "--always")
+    changed = _git("status", "--porcelain", "--untracked-files=no", ":/", f":(exclude){RESULTS}")
+    return f"{commit}-dirty" if commit and changed else commit or None
+
+
+def _git(*words: str) -> str:
+    return subprocess.run(["git", *words], cwd=HERE, capture_output=True, text=True).stdout.strip()

@@ -56,6 +56,30 @@ def test_a_failed_cell_is_kept_and_does_not_stop_the_others(workers, tmp_path):
         assert row.keys() >= {"versions", "machine", "seconds", "commit"}
 
 
+@pytest.mark.skipif(shutil.which("git") is None, reason="needs git")
+def test_a_row_names_the_commit_of_its_code_which_rows_do_not_change(tmp_path, monkeypatch):
+    def git(*words):
+        person = ["-c", "user.name=A", "-c", "user.email=a@example.org"]
+        subprocess.run(["git", *person, *words], cwd=tmp_path, check=True, capture_output=True)
+
+    code, rows = tmp_path / "code.py", tmp_path / "results" / "others.jsonl"
+    rows.parent.mkdir()
+    rows.touch()
+    code.touch()
+    git("init")
+    git("add", ".")
+    git("commit", "-m", "All.")
+    monkeypatch.setattr("benchmarks.runner.HERE", tmp_path)
+    monkeypatch.setattr("benchmarks.runner.RESULTS", rows.parent)
+    commits = []
+    for changed in (rows, code):
+        changed.write_text("1")
+        run(TOY, CELLS[len(commits) :][:1], tmp_path / "toy.jsonl")
+        commits.append(read_rows(tmp_path / "toy.jsonl")[-1]["commit"])
+    assert re.fullmatch("[0-9a-f]+", commits[0])
+    assert commits[1] == f"{commits[0]}-dirty"
+
+
 def threads(cell, device):
     import fdtasil  # noqa: F401  (as a cell's process does)
     from fdtasil.compute import torch_settings
