@@ -220,7 +220,8 @@ class NoisyExpert:
     """The expert acts, in half of the episodes with Gaussian noise (arXiv 2507.09061, section 4).
 
     Attributes:
-        sigma: Standard deviation of the noise, as a share of half the range of each action.
+        sigma: Standard deviation of the noise, as a share of half the range of each action; in its
+            own unit where an action lacks a bound.
     """
 
     sigma: float = 0.1
