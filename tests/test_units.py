@@ -84,6 +84,23 @@ def test_the_imitation_gap_is_the_same_in_any_unit(unit):
     assert gap(unit) > 0.1
 
 
+def test_the_imitation_gap_is_the_mean_of_the_episodes_largest_distances():
+    expert, student = (
+        fdtasil.load_expert(lambda rows, g=g: g * rows[:, :2]) for g in (-0.5, -0.3)
+    )
+    with EnvironmentPool(TOY) as pool:
+        own, other = (
+            rollout(follow(one.policy("act")), pool, [1, 2, 3], 15) for one in (expert, student)
+        )
+        acting = follow(student.policy("evaluate"))
+        judged = evaluate_pair(acting, expert, own, pool, 15, 0, Progress(False))
+    deviation = own.observations.reshape(-1, 5)[:, :4].std(axis=0)  # the last one never moves
+    apart = (other.observations - own.observations)[..., :4] / deviation
+    largest = np.sqrt((apart**2).mean(axis=2)).max(axis=1)
+    assert len(set(largest.round(3))) == 3
+    assert judged.imitation_gap == pytest.approx(largest.mean(), rel=1e-4)
+
+
 @pytest.mark.fault(202)
 @pytest.mark.parametrize("offset", [1e8, -1e9])
 def test_observations_far_from_zero_are_refused_in_float32(offset):
@@ -140,6 +157,22 @@ def test_a_coordinate_in_small_units_is_seen_and_probed(probes):
     with pytest.warns(FdtasilWarning, match=r"1 coordinates deviate by less .* \(2: "):
         small = error([1e4, 1e4, 1e-3, 1e4, 1.0])
     assert small == pytest.approx(usual, rel=0.2)
+
+
+def test_small_units_are_told_of_once_in_a_run_of_several_rounds():
+    units = np.asarray([1e4, 1e4, 1e-3, 1e4, 1.0], np.float32)
+    run = {"episodes": 3, "horizon": 20, "fit": Fit(steps=100), "student": Mlp(8)}
+    with pytest.warns(FdtasilWarning) as told:
+        fdtasil.distill(
+            lambda rows: np.tanh(rows / units @ GAIN.T),
+            lambda: InUnits(units),
+            0,
+            trainer=fdtasil.DAgger(updates=(1, 2)),
+            evaluation_episodes=2,
+            progress=False,
+            **run,
+        )
+    assert sum("ten-thousandth" in str(one.message) for one in told) == 1
 
 
 @pytest.mark.fault(230)
