@@ -302,6 +302,7 @@ FAULTS = {
         282: "an action with one bound, which an exported student passes",
         270: "trust that does not reach the policy that asks for it",
         283: "an agent whose VecNormalize is lost, or applied twice",
+        284: "observations between which nothing lies",
     },
 }
 

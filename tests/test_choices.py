@@ -12,7 +12,7 @@ from sb3_agents import fresh_agent, save_agent, shake
 from toy_forms import InForm, in_form
 
 import fdtasil
-from fdtasil.errors import ExpertError, SettingError
+from fdtasil.errors import ExpertError, FdtasilWarning, SettingError
 from fdtasil.experts.load import expert_in
 from fdtasil.experts.sb3.agent import read_agent
 from fdtasil.rollouts.environments import EnvironmentPool
@@ -338,3 +338,18 @@ def test_recorded_choices_are_taken_as_the_error_says():
     told = caught.value.next_step.partition("there: ")[2]
     data = fdtasil.from_arrays(rows, eval(told, {"np": np, "chosen": chosen}))
     assert fdtasil.distill(None, made, dataset=data, **run).student.action_size == 4
+
+
+@pytest.mark.fault(284)
+def test_where_nothing_lies_between_two_observations_the_choices_are_cloned():
+    law = lambda fields: np.asarray(fields) % 4  # noqa: E731
+    run = QUICK | {"fit": fdtasil.Fit(steps=300), "horizon": 50, "episodes": 10}
+    with pytest.warns(FdtasilWarning) as told:
+        result = fdtasil.distill(law, "FrozenLake-v1", **run)
+    assert "nothing lies between two of them" in str(told[0].message)
+    assert result.settings["probes"] == "none"
+    assert result.evaluation.agreement == 1.0
+    asked = []
+    with pytest.raises(SettingError, match="leave probes= out"):
+        fdtasil.distill(lambda f: [asked.append(len(f)), law(f)][1], "FrozenLake-v1", 3, **run)
+    assert sum(asked) < 10  # what it answers is looked at, and nothing is recorded

@@ -98,6 +98,8 @@ class Arguments:
                 "in which the expert acts as in cloning: raise episodes="
             )
         usual = self._usual(subject)
+        if usual.probes is not None and not usual.probes_given and not usual.moved:
+            return self._unprobed(usual.probes, subject)
         if self.anew is None or subject.expert is None:
             return usual
         student = self.student or usual_architecture(anew=True)
@@ -121,6 +123,22 @@ class Arguments:
         if not (allowed if anew is None else anew):
             return replace(usual, reason=f"asked once: {due:,} queries are more than max_queries")
         return replace(fresh, reason=f"asked anew all the time: {work:,} multiply-adds a query")
+
+    def _unprobed(self, source: Probes, subject: Subject) -> Configuration:
+        """Return plain cloning, where nothing that the student sees can be moved a little.
+
+        Raises:
+            SettingError: If probes are asked for.
+        """
+        whole = "choices, flags or whole numbers, and nothing lies between two of them"
+        if not self.anew_if_cheap:
+            raise SettingError(
+                f"probes={source.describe()!r}, and all that the student sees are {whole}",
+                "a coordinate that can be moved a little",
+                "leave probes= out, or pass probes=0: plain behaviour cloning",
+            )
+        warn(f"all that the student sees are {whole}: plain behaviour cloning (probes=0)")
+        return replace(self, probes=None, anew=None)._usual(subject)
 
     def _usual(self, subject: Subject) -> Configuration:
         given, source, expert = self.given, self.probes, subject.expert

@@ -188,16 +188,21 @@ class Configuration:
         probes = self.probes
         return probes is not None and not self.probes_given and probes.space == "whitened"
 
+    @property
+    def moved(self) -> set[int]:
+        """The coordinates that probes may move; of a function of the observation, any."""
+        columns = self.student_obs
+        seen = columns if isinstance(columns, tuple) else range(self.observation_size)
+        return set(seen) - set(self.held)
+
     def check_spread(self) -> None:
         """Refuse deviations that no probe is moved by; plain cloning normalises by them.
 
         Raises:
             SettingError: If there are some.
         """
-        columns = self.student_obs
-        seen = columns if isinstance(columns, tuple) else range(self.observation_size)
-        moved = set(seen) - set(self.held)
-        if not self.spread.where_still and (lost := sorted({*self.spread.deviations} - moved)):
+        lost = sorted({*self.spread.deviations} - self.moved)
+        if lost and not self.spread.where_still:
             raise SettingError(
                 f"spread= of coordinate {lost[0]}, which no probe moves",
                 "coordinates that the student sees, no choices and nothing of the past",
