@@ -186,7 +186,7 @@ def _called(function: Callable[..., object]) -> str:
 
 
 def _indices(student_obs: object, n: int) -> tuple[int, ...]:
-    expected = f"some of the indices 0 to {n - 1}, each once; {n} times True or False; a function"
+    expected = f"indices from 0 to {n - 1}, each once; {n} times True or False; or a function"
     columns: tuple[int, ...] = ()
     with suppress(TypeError, ValueError, OverflowError):
         mask = np.asarray(student_obs)
