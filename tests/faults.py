@@ -303,6 +303,8 @@ FAULTS = {
         270: "trust that does not reach the policy that asks for it",
         283: "an agent whose VecNormalize is lost, or applied twice",
         284: "observations between which nothing lies",
+        285: "a past of zeros before the start, where measurements have an offset",
+        286: "an action that is no number, which a history remembers for ever",
     },
 }
 

@@ -37,7 +37,8 @@ def test_the_past_stands_behind_each_observation():
     for number in range(2):
         rows = states.observations[states.episode == number]
         taken = states.taken[states.episode == number]
-        assert (rows[0, N:] == 0).all()
+        before = np.concatenate([rows[0, :N], np.zeros(M)])
+        assert np.array_equal(rows[0, N:], np.tile(before, H - 1))
         for t in range(2, len(rows)):
             one = np.concatenate([rows[t - 1, :N], taken[t - 1]])
             two = np.concatenate([rows[t - 2, :N], taken[t - 2]])
@@ -224,13 +225,46 @@ def test_what_is_remembered_is_what_an_environment_with_one_bound_takes(spaces):
     student = fdtasil.Student(
         fdtasil.Mlp(8), np.zeros(size), np.ones(size), low, high, random, spaces=spaces
     )
-    policy, past = fdtasil.History(student, H), np.zeros(PAST)
-    for step, row in enumerate(np.random.default_rng(0).standard_normal((20, N))):
+    states = np.random.default_rng(0).standard_normal((20, N))
+    past = np.tile(np.concatenate([states[0], np.zeros(M)]), H - 1)
+    policy, cut = fdtasil.History(student, H), 0
+    for step, row in enumerate(states):
         action, _ = policy.predict(row, episode_start=step == 0)
         whole = np.concatenate([row, past])[None].astype(np.float32)
         assert action == pytest.approx(student.act(whole)[0], abs=1e-6)
-        assert action.min() == 0 or step > 0
+        cut += action.min() == 0
         past = np.concatenate([row, action, past[: -(N + M)]])
+    assert cut > 0
+
+
+@pytest.mark.fault(285)
+def test_before_the_start_there_is_no_other_place_than_any_other():
+    """Zeros would be 0 kelvin, and the scale of all that is past."""
+
+    class Warm(gymnasium.ObservationWrapper):
+        def observation(self, observation):
+            return observation + 300.0
+
+    def scales(wrapped):
+        made = lambda: wrapped(gymnasium.make(TOY))  # noqa: E731
+        result = fdtasil.distill(lambda rows: (rows - rows[:, 4:] + 3) @ GAIN.T, made, 0, **RUN)
+        return result.student.scale.numpy()
+
+    plain, warm = scales(gymnasium.Wrapper), scales(Warm)
+    assert warm == pytest.approx(plain, rel=1e-2)
+    assert warm[N : N + 4] == pytest.approx(warm[:4], rel=0.2)
+
+
+@pytest.mark.fault(286)
+def test_what_is_no_number_is_forgotten_with_the_observation(file):
+    student = fdtasil.distill(file, TOY, 0, **RUN).student
+    rows = np.random.default_rng(0).standard_normal((6, N))
+    for lost in (0, 2):
+        policy = fdtasil.History(student, H)
+        for step, row in enumerate(rows):
+            seen = np.where(step == lost, np.nan, row)
+            action, _ = policy.predict(seen, episode_start=step == 0)
+            assert np.isfinite(action).all() == (step != lost)
 
 
 @pytest.mark.fault(268)

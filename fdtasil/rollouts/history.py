@@ -24,7 +24,10 @@ def present_size(seen: int, history: int, action_size: int) -> tuple[int, int]:
 
 
 class Window:
-    """The steps before the present one, the latest first; zeros before the start of an episode.
+    """The steps before the present one, the latest first.
+
+    Before the start of an episode there stand its first observation and actions of zeros: zeros
+    for observations would be another place than any of 300 kelvin.
 
     Args:
         history: H, how many observations are seen, the present one included.
@@ -34,19 +37,30 @@ class Window:
 
     def __init__(self, history: int, observation_size: int, action_size: int) -> None:
         self._past = np.zeros((history - 1, observation_size + action_size), np.float64)
+        self._size, self._empty = observation_size, True
 
     def clear(self) -> None:
-        """Begin an episode."""
-        self._past[:] = 0
+        """Begin an episode, with the next observation."""
+        self._empty = True
 
     def push(self, observation: np.ndarray, action: np.ndarray) -> None:
-        """Remember a step: what was observed, and what was done."""
+        """Remember a step: what was observed, and what was done.
+
+        A number that is none is remembered as the one before it, or it would never be forgotten:
+        the answer to it is none either, and is remembered in its turn.
+        """
+        step = np.concatenate([np.ravel(observation), np.ravel(action)])
+        step = np.where(np.isfinite(step), step, self._past[0]) if len(self._past) else step
         self._past[1:] = self._past[:-1].copy()
-        self._past[0] = np.concatenate([np.ravel(observation), np.ravel(action)])
+        self._past[:1] = step
 
     def behind(self, observation: np.ndarray) -> np.ndarray:
         """Return an observation (n,) with the past behind it."""
-        return np.append(np.asarray(observation, np.float64), self._past)
+        seen = np.asarray(observation, np.float64)
+        if self._empty:
+            self._past[:, : self._size], self._past[:, self._size :] = seen, 0
+            self._empty = not np.isfinite(seen).all()
+        return np.append(seen, self._past)
 
 
 class WithHistory(gymnasium.Wrapper):
@@ -71,7 +85,7 @@ class WithHistory(gymnasium.Wrapper):
         self._window, self._seen = Window(history, n, m), np.zeros(n)
 
     def reset(self, *, seed: int | None = None, options: Any = None) -> tuple[np.ndarray, Any]:
-        """Begin with zeros behind the first observation."""
+        """Begin with the first observation behind itself."""
         observation, info = self.env.reset(seed=seed, options=options)
         self._window.clear()
         self._seen = np.array(observation)

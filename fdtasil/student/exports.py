@@ -76,7 +76,7 @@ def _order(student: Student, metadata: Mapping[str, str]) -> str:
         n, _ = present_size(student.observation_size, steps, m)
         return (
             f"0:{n} now, then for each of {steps - 1} steps before, the latest first, {n} of its "
-            f"observation and {m} of its action; zeros before an episode began"
+            f"observation and {m} of its action; before a start, the first observation and zeros"
         )
     layout = student.spaces.observations if student.spaces else None
     if layout is None or not layout.names:
