@@ -304,6 +304,7 @@ FAULTS = {
         283: "an agent whose VecNormalize is lost, or applied twice",
         284: "observations between which nothing lies",
         285: "a past of zeros before the start, where measurements have an offset",
+        287: "an environment that does not repeat itself, beside a coordinate of large numbers",
         286: "an action that is no number, which a history remembers for ever",
     },
 }

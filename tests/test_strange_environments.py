@@ -375,3 +375,34 @@ def test_a_folder_that_somebody_copied_is_no_checkpoint(linear, tmp_path):
         stage.with_name(name).mkdir()
     assert _numbered(tmp_path, 0, "training") == []
     assert fdtasil.distill(linear, TOY, 2, resume=tmp_path, **QUICK).evaluation
+
+
+class Ambient(Integrator):
+    """Positions of a centimetre beside a pressure that stands still."""
+
+    def __init__(self, pressure, random=None):
+        super().__init__()
+        self.pressure, self.random = pressure, random
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        if self.random is not None:
+            self.position = self.random.uniform(-1, 1, 2)
+        return self._observe(), {}
+
+    def _observe(self):
+        seen = super()._observe()
+        return np.append(0.01 * seen[:4], self.pressure)
+
+
+@pytest.mark.fault(287)
+@pytest.mark.parametrize("pressure", [1.0, 101_325.0])
+def test_a_large_coordinate_hides_no_other_start(pressure):
+    random = np.random.default_rng(0)
+    with (
+        EnvironmentPool(lambda: Ambient(pressure, random)) as pool,
+        pytest.warns(FdtasilWarning, match="same first observation twice with one seed"),
+    ):
+        check_repeats(pool, 0)
+    with EnvironmentPool(lambda: Ambient(pressure)) as pool:
+        check_repeats(pool, 0)

@@ -28,6 +28,9 @@ _STEPS = 3  # a wrapper that remembers shows it at the first, a simulator that i
 # Of two numbers that are the same but for the rounding of a simulator: relative to the value, and
 # to the largest one beside it (a coordinate may be all rounding).
 _SAME, _BESIDE = 1e-4, 1e-6
+# Of a coordinate's size, what counts as movement beside how far it moves. One of 100,000 pascals
+# would hide how another moves by a centimetre, and itself how it moves by a few pascals.
+_STILL = 0.05
 
 
 @dataclass(frozen=True)
@@ -51,23 +54,31 @@ class Trial:
         """Return what differs by more than rounding, or None."""
         if len(self.rewards) != len(other.rewards):
             return "length of the episode"
-        if differ(self.observations[0], other.observations[0]):
+        moves = np.ptp(self.observations, axis=0)
+        if differ(self.observations[0], other.observations[0], moves):
             return "first observation"
         if differ(self.rewards, other.rewards):
             return "reward"
-        return "observation" if differ(self.observations, other.observations) else None
+        return "observation" if differ(self.observations, other.observations, moves) else None
 
 
-def differ(ours: np.ndarray, theirs: np.ndarray) -> bool:
+def differ(ours: np.ndarray, theirs: np.ndarray, moves: np.ndarray | None = None) -> bool:
     """Whether two arrays of one shape differ by more than a simulator's rounding.
+
+    Args:
+        ours: (..., n).
+        theirs: The same.
+        moves: (n,) how far each coordinate moves; None where only its size tells.
 
     Example:
         >>> first, again = np.array([1e-7, 3.0]), np.array([1.1e-7, 3.0])
         >>> differ(first, again), differ(first, 2 * again)
         (False, True)
     """
-    sizes = np.maximum(np.abs(ours), np.abs(theirs)).astype(np.float64)
-    bound = _SAME * sizes.reshape(-1, sizes.shape[-1]).max(axis=0) + _BESIDE * sizes.max()
+    largest = np.maximum(np.abs(ours), np.abs(theirs)).astype(np.float64)
+    sizes = largest.reshape(-1, largest.shape[-1]).max(axis=0)
+    reach = sizes if moves is None else np.minimum(sizes, moves + _STILL * sizes)
+    bound = _SAME * reach + _BESIDE * (sizes if moves is None else moves).max()
     return bool((np.abs(ours.astype(np.float64) - theirs) > bound).any())
 
 
