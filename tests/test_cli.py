@@ -377,7 +377,7 @@ def test_what_was_found_is_written_for_a_script(expert, inside, tmp_path):
         found = tmp_path / f"{command}.json"
         done = inside(command, expert, TOY, *short, "--json", found, cwd=tmp_path)
         assert done.returncode == 0, done.stderr
-        assert f"written: {found.name}" in done.stdout
+        assert f"written: {found}" in done.stdout
         plain = json.loads(found.read_text(), parse_constant=float)
         assert plain.keys() >= {"evaluate": {"ci95"}, "diagnose": {"fidelity"}}[command]
         assert "NaN" not in found.read_text()

@@ -14,6 +14,7 @@ import fdtasil
 from fdtasil.errors import ExpertError, SettingError
 from fdtasil.experts.load import load_expert
 from fdtasil.files.onnx.recurrent import find_memory
+from fdtasil.results.summary import call_of
 from fdtasil.student.schedule import Schedule
 
 pytestmark = pytest.mark.usefixtures("no_pictures")
@@ -274,6 +275,71 @@ def test_a_memory_that_does_not_begin_with_zeros_is_refused():
 
     with pytest.raises(ExpertError, match="another memory than zeros"):
         load_expert(Ones(), N, 2)
+
+
+@pytest.mark.fault(288)
+def test_a_memory_that_does_not_begin_with_zeros_shows_where_episodes_begin():
+    """Elsewhere this law is at its bounds, whatever it remembers."""
+
+    class Settles:
+        def predict(self, observation, state=None, episode_start=None, deterministic=False):
+            seen = np.asarray(observation[:, :2], np.float64)
+            last = (
+                seen
+                if state is None
+                else np.where(np.reshape(episode_start, (-1, 1)), seen, state)
+            )
+            far = 1e4 * (observation[:, 4:] - 3)  # the toy's constant
+            return np.clip(far + seen - last, -1, 1), seen
+
+    assert load_expert(Settles(), N, 2).memory is not None
+    with pytest.raises(ExpertError, match="another memory than zeros"):
+        fdtasil.distill(Settles(), TOY, 0, progress=False, **QUICK)
+
+
+class Seats(Remembers):
+    """Raises where it is asked about that many rows."""
+
+    def __init__(self, seats):
+        self.seats = seats
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=False):
+        if len(observation) in self.seats:
+            raise ValueError("no seat")
+        return super().predict(observation, state, episode_start)
+
+
+@pytest.mark.fault(289)
+@pytest.mark.parametrize("seats", [(1,), range(4, 99)])
+def test_what_an_expert_with_a_memory_raises_is_no_fault_of_the_environment(seats):
+    with pytest.raises(ExpertError, match=r"raised ValueError.*no seat"):
+        fdtasil.distill(Seats(seats), TOY, 0, progress=False, **QUICK)
+
+
+@pytest.mark.fault(289)
+def test_a_state_that_can_not_be_carried_says_how_it_is_asked_for():
+    class Listed:
+        def predict(self, observation, state=None, episode_start=None, deterministic=False):
+            return observation[:, :2], np.zeros((len(observation), 1)).tolist()
+
+    class Short:
+        def predict(self, observation, **ignored):
+            return observation[:, :2], np.zeros((len(observation), 1))
+
+    class Alone:
+        def predict(self, observation):
+            return observation[:, :2], np.zeros((len(observation), 1))
+
+    for one in (Listed(), Short(), Alone()):
+        with pytest.raises(ExpertError, match=r"predict\(observation, state, episode_start\)"):
+            fdtasil.distill(one, TOY, 0, progress=False, **QUICK)
+
+
+def test_the_call_of_a_run_with_memory_and_history_can_be_made():
+    result = fdtasil.distill(Remembers(), TOY, 0, history=2, progress=False, **QUICK)
+    call = call_of(result.settings, 2)
+    assert "history=2" in call
+    assert "student_obs" not in call
 
 
 def test_inspect_and_gains_take_it_too(file, inside):

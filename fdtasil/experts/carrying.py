@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from fdtasil.errors import SettingError
+from fdtasil.errors import ExpertError, SettingError, first_line
 from fdtasil.experts.expert import Expert
 from fdtasil.experts.memory import OnColumns
 from fdtasil.rollouts.environments import EnvironmentPool
@@ -54,7 +54,15 @@ def carry(
 
         def after(observation: np.ndarray, before: np.ndarray) -> np.ndarray:
             expert.count(1, "remember")
-            return memory.after(observation[:n], before)
+            try:
+                return memory.after(observation[:n], before)
+            except Exception as error:  # the environment, which carries it, is not to blame
+                raise ExpertError(
+                    f"{expert.name} raised {type(error).__name__}, asked for its memory after one "
+                    f"observation: {first_line(error)}",
+                    "actions and a state for (1, n) observations too",
+                    "mend it, or let it answer NaN and keep its state where it can't",
+                ) from error
 
         pool.wrap(lambda environment: Remembering(environment, after, remembered))
     return asked, past, remembered

@@ -11,6 +11,7 @@ from fdtasil.experts.carrying import carry
 from fdtasil.experts.expert import Expert
 from fdtasil.experts.gate import GATE_STATES, Finding, admit_expert, examine_expert
 from fdtasil.experts.load import ExpertLike, expert_in
+from fdtasil.experts.memory import check_beginning
 from fdtasil.progress import Progress
 from fdtasil.rollouts.behaviours import farthest_apart, follow_answers, random_behaviour
 from fdtasil.rollouts.environments import EnvironmentPool, resolve_horizon
@@ -86,6 +87,9 @@ def check_first(
     """
     check_repeats(pool, starts[0], force=force)
     first = first_observations(pool, [starts[e % len(starts)] for e in range(GATE_STATES)])
+    if expert.memory is not None:
+        size = len(expert.takes or range(first.shape[1])) - expert.memory.size
+        check_beginning(expert.memory, first[:, :size], expert.name)
     announce = partial(_announce, rows=rows)
     admit_expert(expert, first, pool.boxes, force=force, largest=largest, announce=announce)
 

@@ -11,9 +11,10 @@ from typing import Any
 import numpy as np
 import torch
 
+from fdtasil.errors import ExpertError, first_line
 from fdtasil.rollouts.behaviours import Policy
 
-__all__ = ["Memory", "OnColumns", "Step", "stateless"]
+__all__ = ["Memory", "OnColumns", "Step", "check_beginning", "stateless"]
 
 Step = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 """(B, n) observations and (B, k) memories -> (B, m) actions, and the memories after them."""
@@ -26,15 +27,49 @@ class Memory:
     Attributes:
         size: k, how many numbers.
         step: What it does with them.
+        begin: (B, n) -> (B, m) its first answers of episodes, where it has a beginning of its own.
     """
 
     size: int
     step: Step
+    begin: Policy | None = None
 
     def after(self, observation: np.ndarray, memory: np.ndarray) -> np.ndarray:
         """Return the memory (k,) after one observation (n,)."""
         _, memories = self.step(observation[None].astype(np.float32), memory[None])
         return memories[0]
+
+
+def check_beginning(memory: Memory, observations: np.ndarray, name: str) -> None:
+    """Refuse a memory that does not begin with zeros.
+
+    Args:
+        memory: Of the expert.
+        observations: (B, n) where episodes begin. A law that is at a bound shows nothing there.
+        name: Of the expert.
+
+    Raises:
+        ExpertError: If the first answer of an episode is not that to a memory of zeros.
+    """
+    if memory.begin is None:
+        return
+    nothing = np.zeros((len(observations), memory.size), np.float32)
+    try:
+        zeros, _ = memory.step(observations.copy(), nothing)
+        begun = memory.begin(observations.copy())
+    except Exception as error:
+        raise ExpertError(
+            f"{name} raised {type(error).__name__} where episodes begin: {first_line(error)}",
+            "actions and a state",
+            "mend it, or let it answer NaN where it can't",
+        ) from error
+    if not np.allclose(begun, zeros, rtol=1e-3, atol=1e-4, equal_nan=True):
+        raise ExpertError(
+            f"{name} begins an episode with another memory than zeros",
+            "a memory of zeros at the start",
+            "wrap it: let its state be the difference to the first one, or hold a flag that is 0 "
+            "until the first step",
+        )
 
 
 def stateless(step: Step, observation_size: int) -> Policy:

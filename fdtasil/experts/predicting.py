@@ -80,8 +80,10 @@ class _Predicts:
         if state is not None:
             raise ExpertError(
                 f"{self.name} returns a state beside its actions",
-                "a state of arrays whose rows are those of the observations, zeros at the start",
-                "return such arrays, a tuple or a dictionary of them, or None for no memory",
+                "predict(observation, state, episode_start), and a state of arrays with a row for "
+                "each observation, zeros at the start",
+                "take and return these, a tuple or a dictionary of such arrays, or None for no "
+                "memory; it is called with 2 and 3 rows of zeros first",
             )
         return actions
 

@@ -1,14 +1,13 @@
 """Objects whose `predict` takes a state and returns the next one."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from fdtasil.errors import ExpertError
 from fdtasil.experts.expert import Expert
-from fdtasil.experts.memory import Memory, stateless
+from fdtasil.experts.memory import Memory, check_beginning, stateless
 
 __all__ = ["with_state"]
 
@@ -32,33 +31,17 @@ def with_state(
         states = [_ask_first(source, rows, observation_size, options) for rows in (2, 3)]
     except Exception:  # of the user's; the gate will show it
         return None
-    if any(state is None for state in states):
+    if any(state is None for state in states) or len({len(_leaves(one)) for one in states}) > 1:
         return None
     axes = [_axis(*parts) for parts in zip(*map(_leaves, states), strict=True)]
     if None in axes:  # no memory of rows
         return None
     step = _Carries(source, statistics, options, states[0], tuple(axis or 0 for axis in axes))
-    memory = Memory(_flat(_leaves(states[0]), step.axes).shape[1], step)
-    _check_start(source, step, memory.size, observation_size, name)
-    n = observation_size
-    return Expert(stateless(step, n), name, n + memory.size, memory=memory)
-
-
-def _check_start(source: Any, step: "_Carries", k: int, n: int, name: str) -> None:
-    """Refuse a memory that does not begin with zeros.
-
-    Raises:
-        ExpertError: If the first answer of an episode is not that to a memory of zeros.
-    """
-    rows = np.random.default_rng(0).standard_normal((2, n)).astype(np.float32)
-    begun = source.predict(rows.copy(), episode_start=np.ones(2, bool), **step.options)[0]
-    zeros, _ = replace(step, statistics=None)(rows.copy(), np.zeros((2, k), np.float32))
-    if not np.allclose(begun, zeros, rtol=1e-3, atol=1e-4):
-        raise ExpertError(
-            f"{name} begins an episode with another memory than zeros",
-            "a memory of zeros at the start",
-            "wrap it: let its state be the difference to the first one",
-        )
+    n, size = observation_size, _flat(_leaves(states[0]), step.axes).shape[1]
+    memory = Memory(size, step, step.begin)
+    some = np.random.default_rng(0).standard_normal((2, n)).astype(np.float32)
+    check_beginning(memory, some, name)  # and again where episodes begin
+    return Expert(stateless(step, n), name, n + size, memory=memory)
 
 
 def _ask_first(source: Any, rows: int, n: int, options: Mapping[str, bool]) -> Any:
@@ -116,8 +99,7 @@ class _Carries:
     def __call__(
         self, observations: np.ndarray, memories: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        if self.statistics is not None:
-            observations = self.statistics.normalize_obs(observations)
+        observations = self._normalised(observations)
         rows, parts, start = len(observations), [], 0
         for part, axis in zip(_leaves(self.like), self.axes, strict=True):
             shape = np.moveaxis(part, axis, 0).shape[1:]
@@ -130,3 +112,15 @@ class _Carries:
             observations, state=state, episode_start=begun, **self.options
         )
         return actions, _flat(_leaves(after), self.axes)
+
+    def begin(self, observations: np.ndarray) -> np.ndarray:
+        """(B, n) -> (B, m), its first answers of episodes."""
+        begun = np.ones(len(observations), bool)
+        return self.source.predict(
+            self._normalised(observations), episode_start=begun, **self.options
+        )[0]
+
+    def _normalised(self, observations: np.ndarray) -> np.ndarray:
+        if self.statistics is None:
+            return observations
+        return self.statistics.normalize_obs(observations)

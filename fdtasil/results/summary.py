@@ -70,7 +70,7 @@ def call_of(settings: Mapping[str, Any], history: int) -> str:
         given.append("dataset=dataset")
     given += [f"{name}={value}" for name, value in plain.items()]
     seen = settings.get("student_obs")
-    if seen is not None:
+    if seen is not None and history == 1:  # with a history, the expert's memory alone is unseen
         given.append(f"student_obs={'student_obs' if 'student_obs' in lost else repr(seen)}")
     if settings.get("keep") not in (None, "all"):
         given.append(f"keep={settings['keep']!r}")

@@ -10,7 +10,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from fdtasil.errors import EnvironmentFault, first_line, warn
+from fdtasil.errors import EnvironmentFault, ExpertError, first_line, warn
 from fdtasil.rollouts.behaviours import Decision, silent_rows
 from fdtasil.rollouts.environments import EnvironmentPool
 from fdtasil.rollouts.episodes import Episodes
@@ -85,6 +85,8 @@ class Recording:
             answer = environment.step(action)
         except Mismatch as mismatch:
             raise self._promised(episode, step, mismatch) from None
+        except ExpertError:  # of one whose memory is carried along
+            raise
         except Exception as error:
             raise self._crash(episode, step, "step()", error) from error
         try:

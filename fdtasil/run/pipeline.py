@@ -91,13 +91,14 @@ def distill(
             Face hub (`hf://org/repo/file[@revision]`), a torch module, an object with
             stable-baselines3's `predict`, a function on batches (B, n) -> (B, m) in environment
             units, an address, or what `load_expert` made of one of them with options of its own.
-            None with `dataset`: then nobody is asked.
+            None with `dataset`: then nobody is asked, and `probes` are those that it holds, or 0.
         env: A gymnasium id (`module:Id` too), a gymnasium environment, a vector environment
             (gymnasium's or stable-baselines3's), a function making one, or a
             `fdtasil.Environment`, which says what it is made and reset with. None with `dataset`:
             then nothing is recorded or evaluated.
         probes: The derivative source. Left out, what `dataset` holds, or "fresh" for files,
-            modules and agents of few multiply-adds, and 10 for others. 0 (plain behaviour
+            modules and agents of few multiply-adds, 10 for others, and 0 where nothing that the
+            student sees can be moved a little. 0 (plain behaviour
             cloning), "fresh" (asked anew at every visit, near and far; the answers are labels),
             N (N random directions at each state; half of them lead towards other visited states
             where few of all observations can occur), "sphere:N" (N isotropic directions at each

@@ -7,7 +7,7 @@ from typing import Literal
 
 import numpy as np
 
-from fdtasil.checks import check_count
+from fdtasil.checks import check_count, check_suffix
 from fdtasil.experts.examination import look_closely
 from fdtasil.files.storage import write_bytes
 from fdtasil.probes.gains import Gains, gains
@@ -53,7 +53,8 @@ def command(
         reset_options: What each reset is given as its options, as JSON.
     """
     check_count("states", states)
-    file = None if out is None else out.absolute()  # an environment may change the folder
+    # Absolute: an environment may change the folder.
+    file = None if out is None else check_suffix(out, ".npz").absolute()
     import_module_of(env)
     place = wanted(env, env_kwargs, reset_options)
     source = opened(expert, place, output=output, inputs=inputs, trust=trust)

@@ -41,4 +41,4 @@ def say(found: Found, file: Path | None) -> None:
         write_bytes(file, json.dumps(plain, indent=2).encode())
     print(found)
     if file is not None:
-        print(f"written: {file.name}")
+        print(f"written: {file}")
