@@ -306,6 +306,7 @@ FAULTS = {
         285: "a past of zeros before the start, where measurements have an offset",
         288: "a memory of other than zeros, which shows at real states alone",
         289: "what an expert with a memory raises, or returns as its state",
+        290: "recorded scores that are not centred, beside an expert's",
         287: "an environment that does not repeat itself, beside a coordinate of large numbers",
         286: "an action that is no number, which a history remembers for ever",
     },

@@ -258,7 +258,7 @@ def test_a_history_of_choices_is_what_was_chosen():
     policy = fdtasil.History(result.student, 2)
     environment = InForm("box", "choice")
     seen, _ = environment.reset(seed=0)
-    before = np.zeros(9)
+    before = np.append(seen, np.zeros(4))
     for step in range(5):
         action, _ = policy.predict(seen, episode_start=step == 0)
         flat = result.student.act(np.append(seen, before)[None].astype(np.float32))[0]
@@ -353,3 +353,18 @@ def test_where_nothing_lies_between_two_observations_the_choices_are_cloned():
     with pytest.raises(SettingError, match="leave probes= out"):
         fdtasil.distill(lambda f: [asked.append(len(f)), law(f)][1], "FrozenLake-v1", 3, **run)
     assert sum(asked) < 10  # what it answers is looked at, and nothing is recorded
+
+
+@pytest.mark.fault(290)
+def test_recorded_scores_are_centred_as_an_experts_are():
+    """Else the student would learn them at the states, and others at the probes around."""
+    rows = rows_of()
+    chosen = scores(rows).argmax(axis=1)
+    data = fdtasil.from_arrays(rows, np.eye(4)[chosen])
+    lookup = lambda x: 1 + scores(x).argmax(axis=1)  # noqa: E731
+    made, run = lambda: InForm("box", "choice"), QUICK | {"episodes": None}
+    result = fdtasil.distill(lookup, made, 3, dataset=data, progress=False, **run)
+    assert result.demonstrations.actions == pytest.approx(np.eye(4)[chosen] - 0.25)
+    kept = result.dataset
+    again = fdtasil.distill(lookup, made, dataset=kept, progress=False, **run)
+    assert np.array_equal(again.demonstrations.actions, kept.demonstrations.actions)

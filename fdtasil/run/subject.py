@@ -9,6 +9,7 @@ import numpy as np
 
 from fdtasil.checks import spelt
 from fdtasil.demonstrations.dataset import Dataset, warn_of_bounds
+from fdtasil.demonstrations.states import Demonstrations
 from fdtasil.errors import SettingError, warn
 from fdtasil.experts.carrying import carry
 from fdtasil.experts.expert import Expert
@@ -21,6 +22,8 @@ from fdtasil.rollouts.spaces import Layout, Spaces
 from fdtasil.student.view import StudentObservation, describe_view
 
 __all__ = ["Subject", "bounded", "history_with", "named", "open_subject", "visible"]
+
+_ROUNDING = 1e-5  # of the largest score
 
 
 @dataclass(frozen=True)
@@ -120,6 +123,9 @@ def open_subject(
 def bounded(given: Dataset, pool: EnvironmentPool) -> Dataset:
     """Return a dataset with the environment's bounds of those actions that it has none of.
 
+    Scores of its choices are centred, as an expert's are: a student that learns from both would
+    learn from two otherwise.
+
     Raises:
         SettingError: If no action lies within both.
     """
@@ -134,10 +140,19 @@ def bounded(given: Dataset, pool: EnvironmentPool) -> Dataset:
         raise SettingError(found, theirs, "leave low= and high= out of from_arrays")
     if not (np.allclose(low, boxes.low) and np.allclose(high, boxes.high)):
         warn(f"{found}: the student stays within them; {theirs}")
-    whole = replace(given, low=low, high=high)
+    states = _centred(given.demonstrations, pool.spaces.actions)
+    whole = replace(given, low=low, high=high, demonstrations=states)
     if not (np.array_equal(low, given.low) and np.array_equal(high, given.high)):
         warn_of_bounds(whole)
     return whole
+
+
+def _centred(states: Demonstrations, actions: Layout) -> Demonstrations:
+    """Return states with scores that sum to zero; those that do, but for rounding, as they are."""
+    centred = actions.centred(states.actions.copy())
+    if np.allclose(centred, states.actions, rtol=0, atol=_ROUNDING * np.abs(centred).max()):
+        return states
+    return replace(states, actions=centred)
 
 
 def history_with(history: int, given: Dataset | None) -> int:
