@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
-from conftest import TOY, mlp_onnx
+from conftest import QUICK, TOY, mlp_onnx
 from test_student import make
 
 import fdtasil
@@ -353,3 +353,24 @@ def test_the_comment_says_what_stands_where():
         assert "bservation: 0:1 goal, 1:3 pose" in export(student, NEAR, {}, name).decode()
     told = export(make((8,)), NEAR, {"fdtasil.history": "1"}, "student.h").decode()
     assert "0:3 now, then for each of 0 steps before" in told
+
+
+@pytest.mark.parametrize("name", ["student.c", "student.h", "student.py"])
+def test_a_file_says_what_a_student_sees_of_the_environments_observation(name):
+    def told(metadata):
+        return export(make((8,)), NEAR, metadata, name).decode()
+
+    assert "0:3 now, then for each of 0 steps" in told({"fdtasil.history": "1"})
+    assert "the numbers 0,2,5 of" in told({"fdtasil.observation_columns": "0,2,5"})
+    odd = told({"fdtasil.observation_function": "the function polar\nimport os */"})
+    assert "what the function polar?import os" in odd
+    assert "\nimport os" not in odd
+
+
+def test_a_student_of_a_function_says_so(linear, tmp_path):
+    def polar(rows):
+        return np.hypot(rows[:, :1], rows[:, 1:2])
+
+    result = fdtasil.distill(linear, TOY, 0, student_obs=polar, **QUICK)
+    result.export(tmp_path / "student.h")
+    assert "what the function polar makes of" in (tmp_path / "student.h").read_text()

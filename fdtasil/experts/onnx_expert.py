@@ -33,9 +33,9 @@ from fdtasil.rollouts.spaces import Layout, Spaces
 if TYPE_CHECKING:
     import onnx
 
-__all__ = ["COLUMNS", "HISTORY", "open_onnx", "said_history"]
+__all__ = ["COLUMNS", "FUNCTION", "HISTORY", "open_onnx", "said_history"]
 
-COLUMNS = "fdtasil.observation_columns"
+COLUMNS, FUNCTION = "fdtasil.observation_columns", "fdtasil.observation_function"
 """Metadata entry of an exported student that sees some coordinates only."""
 HISTORY = "fdtasil.history"
 """Metadata entry of one that sees the last observations and actions: how many observations."""

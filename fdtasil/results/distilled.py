@@ -15,7 +15,7 @@ from fdtasil.demonstrations.dataset import Dataset, check_shapes
 from fdtasil.demonstrations.states import Demonstrations
 from fdtasil.errors import first_line, warn
 from fdtasil.experts.expert import rows_text
-from fdtasil.experts.onnx_expert import COLUMNS, HISTORY
+from fdtasil.experts.onnx_expert import COLUMNS, FUNCTION, HISTORY
 from fdtasil.files.border import reads
 from fdtasil.files.lock import locked
 from fdtasil.files.plain import as_kind, without_infinities
@@ -255,6 +255,8 @@ class Distilled:
             metadata[HISTORY] = str(self.steps_seen)
         if self.view.columns is not None:
             metadata[COLUMNS] = ",".join(map(str, self.view.columns))
+        elif not self.view.is_whole:
+            metadata[FUNCTION] = str(self.settings["student_obs"])
         if self.evaluation is not None:
             for name in ("expert_return", "student_return", "normalized_return"):
                 value = getattr(self.evaluation, name)

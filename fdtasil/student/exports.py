@@ -7,8 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from fdtasil.checks import check_choice
-from fdtasil.errors import ExportError, SettingError
-from fdtasil.experts.onnx_expert import HISTORY
+from fdtasil.errors import ExportError, SettingError, in_one_line, shown
+from fdtasil.experts.onnx_expert import COLUMNS, FUNCTION, HISTORY
 from fdtasil.files.onnx.export import check_finite, export_module
 from fdtasil.rollouts.history import present_size
 from fdtasil.student import plain
@@ -78,9 +78,12 @@ def _order(student: Student, metadata: Mapping[str, str]) -> str:
             f"0:{n} now, then for each of {steps - 1} steps before, the latest first, {n} of its "
             f"observation and {m} of its action; before a start, the first observation and zeros"
         )
+    if FUNCTION in metadata:
+        return f"what {shown(metadata[FUNCTION])} makes of the environment's"
     layout = student.spaces.observations if student.spaces else None
     if layout is None or not layout.names:
-        return ""
+        columns = metadata.get(COLUMNS, "")
+        return f"the numbers {columns} of the environment's" if columns else ""
     pairs = zip(layout.parts, layout.starts, strict=True)
     return ", ".join(f"{start}:{start + part.size} {part.name}" for part, start in pairs)
 
@@ -118,7 +121,9 @@ def _h(student: Student, states: np.ndarray, metadata: Mapping[str, str]) -> byt
 
 def _py(student: Student, states: np.ndarray, metadata: Mapping[str, str]) -> bytes:
     _plain(student)  # who is no such network needs torch
-    return inspect.getsource(plain).encode()
+    order = _order(student, metadata)
+    first = f"# The observation: {in_one_line(order)}\n" if order else ""
+    return f"{first}{inspect.getsource(plain)}".encode()
 
 
 EXPORTS: dict[str, Writer] = {
