@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fdtasil.errors import SettingError, shown
+from fdtasil.errors import SettingError, in_one_line, shown
 
 __all__ = [
     "check_choice",
@@ -144,7 +144,7 @@ def check_suffix(path: Path, *suffixes: str) -> Path:
 def spelt(name: str, value: object) -> str:
     """Return `name=value` for a message, whatever the value is."""
     try:
-        return shown(f"{name}={value!r}")
+        return in_one_line(f"{name}={value!r}")  # an array's has several
     except Exception as error:  # a class of the caller's, or an int of 5,000 digits
         return shown(f"{name}: a {type(value).__name__} ({type(error).__name__} when printed)")
 

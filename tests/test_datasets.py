@@ -97,6 +97,8 @@ def test_missing_parts_are_named(run, linear, tmp_path):
         fdtasil.distill(env=TOY)
     with pytest.raises(SettingError, match="no env"):
         fdtasil.distill(linear)
+    with pytest.raises(SettingError, match="write dataset="):
+        fdtasil.distill(load_dataset(run), probes=0)
     with pytest.raises(SettingError, match="sizes"):
         fdtasil.distill(env="Pendulum-v1", dataset=run)
     with pytest.raises(StorageError, match="can't be read"):

@@ -340,7 +340,7 @@ class _Raised(Exception):
 _DOUBTED = (8, 64, 512)
 """Rows in a row without an answer, after which it is asked what it has answered before."""
 _OF_SHAPES = {"ValueError", "TypeError", "IndexError"}
-_EACH = ", one of a single state by lambda rows: np.array([f(row) for row in rows])"
+_EACH = ", one of a single state by lambda rows: np.stack([np.ravel(f(row)) for row in rows])"
 _NOT_OF_A_ROW = {"MemoryError", "TimeoutError", "RecursionError"}
 
 

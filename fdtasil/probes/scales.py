@@ -65,7 +65,8 @@ class Scales:
             raise SettingError(
                 "the student sees no coordinate that can be probed",
                 "one that moves, and is no choice and no whole number",
-                "check student_obs, or pass probes=0",
+                "check student_obs, subtract an offset beside which float32 rounds movement away, "
+                "or pass probes=0",
             )
         return chosen
 

@@ -79,6 +79,9 @@ def open_subject(
         ExpertError: If the expert can't be opened.
         EnvironmentFault: If the environment can't be used, or does not fit the demonstrations.
     """
+    if isinstance(expert, Dataset):
+        found = "a dataset in the place of the expert"
+        raise SettingError(found, "an expert, or None", "write dataset=, in a shell --dataset")
     if given is None and (expert is None or env is None):
         missing, place = ("expert", "first") if expert is None else ("env", "second")
         raise SettingError(
