@@ -224,3 +224,21 @@ def test_a_large_constant_is_differenced_in_steps_that_float32_has():
 def test_a_scale_that_is_rounded_away_is_refused():
     with pytest.raises(SettingError, match="scale 1e-12 of coordinate 0"):
         gains(lambda rows: rows[:, :1], np.full((3, 2), 1e4), scale=np.full(2, 1e-12))
+
+
+def test_a_coordinate_that_stands_still_does_not_hide_the_error_of_others():
+    """A setpoint of millimetres, whose scale of 1 m is no measured one."""
+    random = np.random.default_rng(0)
+    place, speed = 4e-3 + 1e-4 * random.normal(size=20), 1e-3 * random.normal(size=20)
+    rows = np.column_stack([np.full(20, 4e-3), place, speed])
+
+    def law(seen):
+        return 500 * np.tanh((4e4 * (seen[:, :1] - seen[:, 1:2]) - 1500 * seen[:, 2:]) / 500)
+
+    found = gains(law, rows)
+    assert found.still == (0,)
+    assert "still      0: moved by parts of 1" in str(found)
+    assert 1e-4 < found.relative_error < 0.1
+    told = gains(law, rows, scale=np.array([1e-4, 1e-4, 1e-3]))
+    assert told.still == ()
+    assert told.relative_error < 1e-3

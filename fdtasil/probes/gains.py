@@ -35,6 +35,8 @@ class Gains:
         scale: (n,) unit of each coordinate.
         noise_floor: (m,) root mean square error of an action, as differences show it.
         queries: Rows asked.
+        still: Coordinates that stand still in the states, beside others: their scale of 1 is no
+            measured one, and the norms leave them out.
     """
 
     jacobian: np.ndarray
@@ -43,12 +45,14 @@ class Gains:
     scale: np.ndarray
     noise_floor: np.ndarray
     queries: int
+    still: tuple[int, ...] = ()
 
     @property
     def relative_error(self) -> float:
         """Norm of the errors as a share of the derivatives' norm, coordinates in their units."""
         sizes = np.sqrt(np.nanmean(self.jacobian**2, axis=0))
-        error, size = (float(np.linalg.norm(part * self.scale)) for part in (self.error, sizes))
+        units = np.where(np.isin(np.arange(len(self.scale)), self.still), 0.0, self.scale)
+        error, size = (float(np.linalg.norm(part * units)) for part in (self.error, sizes))
         if size == 0:
             return 0.0 if error == 0 else float("inf")
         return error / size
@@ -65,6 +69,9 @@ class Gains:
         if self.relative_error > _UNSURE:
             told = "these are no derivatives: the expert answers in steps, or with noise"
             rows.append(("note", told))
+        if self.still:
+            listed = ", ".join(map(str, self.still[:6])) + ", ..." * (len(self.still) > 6)
+            rows.append(("still", f"{listed}: moved by parts of 1; scale= says how far they go"))
         strongest = np.argsort(sizes, axis=None)[::-1][:5]
         for action, coordinate in zip(*np.unravel_index(strongest, sizes.shape), strict=True):
             about = f"{sizes[action, coordinate]:.3g} for its scale"
@@ -126,6 +133,7 @@ def gains(
         units,
         noise * 2**0.5,
         asked.queries["probe"],
+        () if scale is not None else _still(rows),
     )
 
 
@@ -146,6 +154,13 @@ def _checked(states: object) -> np.ndarray:
             "pass for example result.demonstrations.observations[:10]",
         ) from None
     return rows
+
+
+def _still(rows: np.ndarray) -> tuple[int, ...]:
+    """Return the coordinates that do not move in some states, where others do."""
+    if (rows == rows[0]).all():
+        return ()
+    return tuple(np.flatnonzero(~measure_scales(rows).live).tolist())
 
 
 def _units(rows: np.ndarray, scale: np.ndarray | None) -> np.ndarray:
