@@ -120,8 +120,8 @@ def torch_settings(device: torch.device, threads: int = 1) -> Iterator[str]:
         before_precision = torch.get_float32_matmul_precision()
         torch.set_num_threads(threads)
         torch.set_default_dtype(torch.float32)
-        torch.empty(_KEPT, dtype=torch.uint8, device="cpu")
         try:
+            torch.empty(_KEPT, dtype=torch.uint8, device="cpu")
             # Of GPUs too, where it rounds, and where the caller may compute beside this run.
             if not torch.cuda.is_available():
                 torch.set_float32_matmul_precision("medium")

@@ -361,10 +361,13 @@ def test_a_file_says_what_a_student_sees_of_the_environments_observation(name):
         return export(make((8,)), NEAR, metadata, name).decode()
 
     assert "0:3 now, then for each of 0 steps" in told({"fdtasil.history": "1"})
-    assert "the numbers 0,2,5 of" in told({"fdtasil.observation_columns": "0,2,5"})
+    assert "environment's numbers 0,2,5" in told({"fdtasil.observation_columns": "0,2,5"})
+    many = ",".join(map(str, range(100)))
+    assert "numbers 100 of them, by" in told({"fdtasil.observation_columns": many})
     odd = told({"fdtasil.observation_function": "the function polar\nimport os */"})
     assert "what the function polar?import os" in odd
     assert "\nimport os" not in odd
+    assert name == "student.py" or "import os */" not in odd
 
 
 def test_a_student_of_a_function_says_so(linear, tmp_path):

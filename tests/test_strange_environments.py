@@ -12,7 +12,7 @@ from fdtasil.errors import EnvironmentFault, FdtasilWarning, SettingError
 from fdtasil.rollouts.behaviours import follow
 from fdtasil.rollouts.environments import EnvironmentPool
 from fdtasil.rollouts.rollout import first_observations, rollout
-from fdtasil.rollouts.trials import check_repeats, fingerprint, other_environment
+from fdtasil.rollouts.trials import check_repeats, differ, fingerprint, other_environment
 from fdtasil.run.folder import _numbered
 
 pytestmark = pytest.mark.usefixtures("no_pictures")
@@ -406,3 +406,34 @@ def test_a_large_coordinate_hides_no_other_start(pressure):
         check_repeats(pool, 0)
     with EnvironmentPool(lambda: Ambient(pressure)) as pool:
         check_repeats(pool, 0)
+    with (
+        EnvironmentPool(lambda: Weather(random)) as pool,
+        pytest.warns(FdtasilWarning, match="same first obs"),
+    ):
+        check_repeats(pool, 0)
+
+
+class Weather(Ambient):
+    """A pressure of its own in each episode, by some tens of pascals."""
+
+    def __init__(self, weather):
+        super().__init__(101_325.0)
+        self.weather = weather
+
+    def reset(self, *, seed=None, options=None):
+        self.pressure = 101_325.0 + self.weather.normal(scale=30.0)
+        return super().reset(seed=seed)
+
+
+@pytest.mark.fault(287)
+@pytest.mark.parametrize(
+    ("ours", "theirs"),
+    [
+        ([[1.0, 1e-9]], [[1.0, 1.3e-9]]),  # of one step
+        ([[0.0, 5.0], [0.0, 5.001]], [[3e-8, 5.0], [3e-8, 5.001]]),  # what is computed in float32
+    ],
+)
+def test_rounding_is_no_difference_where_little_moves(ours, theirs):
+    ours, theirs = np.asarray(ours), np.asarray(theirs)
+    assert not differ(ours, theirs, np.ptp(ours, axis=0))
+    assert differ(ours, np.add(theirs, [0.0, 0.1]), np.ptp(ours, axis=0))

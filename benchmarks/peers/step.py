@@ -131,8 +131,9 @@ def _line(name: str, measured: Sequence[dict[str, list[float]]]) -> list[str]:
     ours = [times[f"fdtasil, {name}"] for times in measured]
     theirs = [times[f"JAX, {name}"] for times in measured if f"JAX, {name}" in times]
     ratios = [
-        [a / b for a, b in zip(one, other, strict=True)]
-        for one, other in zip(ours, theirs, strict=False)
+        [a / b for a, b in zip(times[f"fdtasil, {name}"], times[f"JAX, {name}"], strict=True)]
+        for times in measured
+        if f"JAX, {name}" in times
     ]
     return [name, *(_medians(times) for times in (ours, theirs, ratios))]
 

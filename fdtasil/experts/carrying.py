@@ -55,7 +55,7 @@ def carry(
         def after(observation: np.ndarray, before: np.ndarray) -> np.ndarray:
             expert.count(1, "remember")
             try:
-                return memory.after(observation[:n], before)
+                after = memory.after(observation[:n], before)
             except Exception as error:  # the environment, which carries it, is not to blame
                 raise ExpertError(
                     f"{expert.name} raised {type(error).__name__}, asked for its memory after one "
@@ -63,6 +63,13 @@ def carry(
                     "actions and a state for (1, n) observations too",
                     "mend it, or let it answer NaN and keep its state where it can't",
                 ) from error
+            if after.shape != before.shape:
+                raise ExpertError(
+                    f"{expert.name} returned a state of {after.size} numbers for one observation",
+                    f"{before.size}, as for several",
+                    "return a state with a row for each observation",
+                )
+            return after
 
         pool.wrap(lambda environment: Remembering(environment, after, remembered))
     return asked, past, remembered

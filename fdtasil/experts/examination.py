@@ -89,7 +89,12 @@ def check_first(
     first = first_observations(pool, [starts[e % len(starts)] for e in range(GATE_STATES)])
     if expert.memory is not None:
         size = len(expert.takes or range(first.shape[1])) - expert.memory.size
-        check_beginning(expert.memory, first[:, :size], expert.name)
+        try:
+            check_beginning(expert.memory, first[:, :size], expert.name)
+        except ExpertError as error:
+            if not force:
+                raise
+            warn(f"{error.found} (forced)")
     announce = partial(_announce, rows=rows)
     admit_expert(expert, first, pool.boxes, force=force, largest=largest, announce=announce)
 

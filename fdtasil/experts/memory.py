@@ -14,7 +14,15 @@ import torch
 from fdtasil.errors import ExpertError, first_line
 from fdtasil.rollouts.behaviours import Policy
 
-__all__ = ["Memory", "OnColumns", "Step", "check_beginning", "stateless"]
+__all__ = [
+    "Memory",
+    "OnColumns",
+    "Step",
+    "begins_elsewhere",
+    "check_beginning",
+    "other_beginning",
+    "stateless",
+]
 
 Step = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 """(B, n) observations and (B, k) memories -> (B, m) actions, and the memories after them."""
@@ -40,6 +48,16 @@ class Memory:
         return memories[0]
 
 
+def begins_elsewhere(memory: Memory, observations: np.ndarray) -> bool:
+    """Whether first answers at (B, n) observations are others than those to a memory of zeros."""
+    if memory.begin is None:
+        return False
+    nothing = np.zeros((len(observations), memory.size), np.float32)
+    zeros, _ = memory.step(observations.copy(), nothing)
+    begun = memory.begin(observations.copy())
+    return not np.allclose(begun, zeros, rtol=1e-3, atol=1e-4, equal_nan=True)
+
+
 def check_beginning(memory: Memory, observations: np.ndarray, name: str) -> None:
     """Refuse a memory that does not begin with zeros.
 
@@ -51,25 +69,26 @@ def check_beginning(memory: Memory, observations: np.ndarray, name: str) -> None
     Raises:
         ExpertError: If the first answer of an episode is not that to a memory of zeros.
     """
-    if memory.begin is None:
-        return
-    nothing = np.zeros((len(observations), memory.size), np.float32)
     try:
-        zeros, _ = memory.step(observations.copy(), nothing)
-        begun = memory.begin(observations.copy())
+        elsewhere = begins_elsewhere(memory, observations)
     except Exception as error:
         raise ExpertError(
             f"{name} raised {type(error).__name__} where episodes begin: {first_line(error)}",
             "actions and a state",
             "mend it, or let it answer NaN where it can't",
         ) from error
-    if not np.allclose(begun, zeros, rtol=1e-3, atol=1e-4, equal_nan=True):
-        raise ExpertError(
-            f"{name} begins an episode with another memory than zeros",
-            "a memory of zeros at the start",
-            "wrap it: let its state be the difference to the first one, or hold a flag that is 0 "
-            "until the first step",
-        )
+    if elsewhere:
+        raise other_beginning(name)
+
+
+def other_beginning(name: str) -> ExpertError:
+    """Return what is said of an expert whose memory does not begin with zeros."""
+    return ExpertError(
+        f"{name} begins an episode with another memory than zeros",
+        "a memory of zeros at the start",
+        "wrap it: let its state be the difference to the first one, or hold a flag that is 0 "
+        "until the first step",
+    )
 
 
 def stateless(step: Step, observation_size: int) -> Policy:

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from fdtasil.experts.expert import Expert
-from fdtasil.experts.memory import Memory, check_beginning, stateless
+from fdtasil.experts.memory import Memory, begins_elsewhere, other_beginning, stateless
 
 __all__ = ["with_state"]
 
@@ -40,7 +40,12 @@ def with_state(
     n, size = observation_size, _flat(_leaves(states[0]), step.axes).shape[1]
     memory = Memory(size, step, step.begin)
     some = np.random.default_rng(0).standard_normal((2, n)).astype(np.float32)
-    check_beginning(memory, some, name)  # and again where episodes begin
+    try:
+        elsewhere = begins_elsewhere(memory, some)  # and where episodes begin, again
+    except Exception:  # of the user's: these are no observations of anything
+        elsewhere = False
+    if elsewhere:
+        raise other_beginning(name)
     return Expert(stateless(step, n), name, n + size, memory=memory)
 
 

@@ -21,6 +21,7 @@ _WINDOW = 2  # rungs below the best one that the error's law is fitted to; above
 _BEYOND = (16 / 9 / 5) ** 0.5
 _ROUNDING = float(np.finfo(np.float32).eps)
 _RATIO = 4.0  # of a rung to the one below it
+_HEARD = 10.0  # times the noise of an action, that it changes by along coordinates that move
 _UNSURE = 0.3  # error, as a share of the Jacobian, above which nothing is left of it
 
 
@@ -36,7 +37,7 @@ class Gains:
         noise_floor: (m,) root mean square error of an action, as differences show it.
         queries: Rows asked.
         still: Coordinates that stand still in the states, beside others: their scale of 1 is no
-            measured one, and the norms leave them out.
+            measured one, and norms leave them out where the others count for more than noise.
     """
 
     jacobian: np.ndarray
@@ -52,6 +53,8 @@ class Gains:
         """Norm of the errors as a share of the derivatives' norm, coordinates in their units."""
         sizes = np.sqrt(np.nanmean(self.jacobian**2, axis=0))
         units = np.where(np.isin(np.arange(len(self.scale)), self.still), 0.0, self.scale)
+        if np.linalg.norm(sizes * units) <= _HEARD * np.linalg.norm(self.noise_floor):
+            units = self.scale  # it answers to coordinates that stand still alone
         error, size = (float(np.linalg.norm(part * units)) for part in (self.error, sizes))
         if size == 0:
             return 0.0 if error == 0 else float("inf")

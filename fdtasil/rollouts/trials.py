@@ -77,8 +77,11 @@ def differ(ours: np.ndarray, theirs: np.ndarray, moves: np.ndarray | None = None
     """
     largest = np.maximum(np.abs(ours), np.abs(theirs)).astype(np.float64)
     sizes = largest.reshape(-1, largest.shape[-1]).max(axis=0)
-    reach = sizes if moves is None else np.minimum(sizes, moves + _STILL * sizes)
-    bound = _SAME * reach + _BESIDE * (sizes if moves is None else moves).max()
+    if moves is None or not (moving := moves > _BESIDE * sizes).any():
+        bound = _SAME * sizes + _BESIDE * sizes.max()
+    else:  # what is computed from those that move has their rounding, at least
+        beside = max(_BESIDE * moves.max(), np.finfo(np.float32).eps * sizes[moving].max())
+        bound = _SAME * np.minimum(sizes, moves + _STILL * sizes) + beside
     return bool((np.abs(ours.astype(np.float64) - theirs) > bound).any())
 
 

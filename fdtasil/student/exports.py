@@ -22,6 +22,7 @@ from fdtasil.student.tflite import tflite_model
 
 __all__ = ["EXPORTS", "SPACES", "export"]
 
+_LONG = 120  # letters of a list that a comment shows whole
 SPACES = "fdtasil.spaces"
 """What a file calls the spaces of its environment."""
 
@@ -83,7 +84,10 @@ def _order(student: Student, metadata: Mapping[str, str]) -> str:
     layout = student.spaces.observations if student.spaces else None
     if layout is None or not layout.names:
         columns = metadata.get(COLUMNS, "")
-        return f"the numbers {columns} of the environment's" if columns else ""
+        told = (
+            f"{columns.count(',') + 1} of them, by {COLUMNS}" if len(columns) > _LONG else columns
+        )
+        return f"of the environment's numbers {told}" if columns else ""
     pairs = zip(layout.parts, layout.starts, strict=True)
     return ", ".join(f"{start}:{start + part.size} {part.name}" for part, start in pairs)
 
