@@ -129,12 +129,9 @@ def text(rows: Sequence[Row]) -> str:
 
 def _line(name: str, measured: Sequence[dict[str, list[float]]]) -> list[str]:
     ours = [times[f"fdtasil, {name}"] for times in measured]
-    theirs = [times[f"JAX, {name}"] for times in measured if f"JAX, {name}" in times]
-    ratios = [
-        [a / b for a, b in zip(times[f"fdtasil, {name}"], times[f"JAX, {name}"], strict=True)]
-        for times in measured
-        if f"JAX, {name}" in times
-    ]
+    theirs = [times[f"JAX, {name}"] for times in measured] if name in _SHARED else []
+    pairs = zip(ours, theirs, strict=True) if theirs else ()
+    ratios = [[a / b for a, b in zip(*pair, strict=True)] for pair in pairs]
     return [name, *(_medians(times) for times in (ours, theirs, ratios))]
 
 

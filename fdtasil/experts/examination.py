@@ -9,9 +9,15 @@ import numpy as np
 from fdtasil.errors import ExpertError, warn
 from fdtasil.experts.carrying import carry
 from fdtasil.experts.expert import Expert
-from fdtasil.experts.gate import GATE_STATES, Finding, admit_expert, examine_expert
+from fdtasil.experts.gate import (
+    GATE_STATES,
+    Finding,
+    admit_expert,
+    examine_expert,
+    raise_problems,
+)
 from fdtasil.experts.load import ExpertLike, expert_in
-from fdtasil.experts.memory import check_beginning
+from fdtasil.experts.memory import beginning_problem
 from fdtasil.progress import Progress
 from fdtasil.rollouts.behaviours import farthest_apart, follow_answers, random_behaviour
 from fdtasil.rollouts.environments import EnvironmentPool, resolve_horizon
@@ -89,12 +95,8 @@ def check_first(
     first = first_observations(pool, [starts[e % len(starts)] for e in range(GATE_STATES)])
     if expert.memory is not None:
         size = len(expert.takes or range(first.shape[1])) - expert.memory.size
-        try:
-            check_beginning(expert.memory, first[:, :size], expert.name)
-        except ExpertError as error:
-            if not force:
-                raise
-            warn(f"{error.found} (forced)")
+        problem = beginning_problem(expert.memory, first[:, :size], expert.name)
+        raise_problems([Finding("beginning", "a memory of zeros", problem)], force=force)
     announce = partial(_announce, rows=rows)
     admit_expert(expert, first, pool.boxes, force=force, largest=largest, announce=announce)
 

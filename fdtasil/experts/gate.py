@@ -20,6 +20,7 @@ __all__ = [
     "compare_again",
     "examine_expert",
     "large_batch",
+    "raise_problems",
 ]
 
 GATE_STATES = 16

@@ -18,8 +18,8 @@ __all__ = [
     "Memory",
     "OnColumns",
     "Step",
+    "beginning_problem",
     "begins_elsewhere",
-    "check_beginning",
     "other_beginning",
     "stateless",
 ]
@@ -58,27 +58,25 @@ def begins_elsewhere(memory: Memory, observations: np.ndarray) -> bool:
     return not np.allclose(begun, zeros, rtol=1e-3, atol=1e-4, equal_nan=True)
 
 
-def check_beginning(memory: Memory, observations: np.ndarray, name: str) -> None:
-    """Refuse a memory that does not begin with zeros.
+def beginning_problem(memory: Memory, observations: np.ndarray, name: str) -> ExpertError | None:
+    """Return what is wrong with a memory's beginning, or None.
 
     Args:
         memory: Of the expert.
         observations: (B, n) where episodes begin. A law that is at a bound shows nothing there.
         name: Of the expert.
-
-    Raises:
-        ExpertError: If the first answer of an episode is not that to a memory of zeros.
     """
     try:
         elsewhere = begins_elsewhere(memory, observations)
     except Exception as error:
-        raise ExpertError(
+        problem = ExpertError(
             f"{name} raised {type(error).__name__} where episodes begin: {first_line(error)}",
             "actions and a state",
             "mend it, or let it answer NaN where it can't",
-        ) from error
-    if elsewhere:
-        raise other_beginning(name)
+        )
+        problem.__cause__ = error
+        return problem
+    return other_beginning(name) if elsewhere else None
 
 
 def other_beginning(name: str) -> ExpertError:
