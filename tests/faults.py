@@ -309,6 +309,8 @@ FAULTS = {
         290: "recorded scores that are not centred, beside an expert's",
         287: "an environment that does not repeat itself, beside a coordinate of large numbers",
         286: "an action that is no number, which a history remembers for ever",
+        291: "a recording whose student is to see more or less of the past",
+        292: "stored answers beside an expert that is to be asked for others",
     },
 }
 

@@ -16,6 +16,8 @@ from fdtasil import Fit, Mlp
 from fdtasil.demonstrations.dataset import Dataset, load_dataset
 from fdtasil.errors import ExpertError, FdtasilWarning, SettingError, StorageError
 from fdtasil.probes.answers import Answers
+from fdtasil.results.card import card_of
+from fdtasil.results.page import page_of
 from fdtasil.student.view import View
 
 
@@ -236,6 +238,34 @@ def test_probes_that_are_left_out_are_those_that_are_stored(linear):
     for ten in (10, "10", "sphere:10"):
         with pytest.raises(SettingError, match=r":10.* with stored answers to 'sphere:5,"):
             fdtasil.distill(dataset=stored.dataset, probes=ten, **SMALL)
+
+
+@pytest.mark.fault(292)
+def test_other_probes_than_the_stored_ones_are_asked_where_somebody_answers(linear):
+    stored = fdtasil.distill(linear, TOY, "sphere:2", **QUICK).dataset
+    with pytest.warns(FdtasilWarning, match=r"'sphere:2,.* are not used: .* anew, 'sphere:5"):
+        more = fdtasil.distill(linear, TOY, "sphere:5", dataset=stored, **SMALL)
+    alone = replace(stored, probes=None, answers=None)
+    expected = fdtasil.distill(linear, TOY, "sphere:5", dataset=alone, **SMALL)
+    assert more.answers.values.shape[1] == 5
+    assert more.queries == expected.queries
+    assert more.student.to_bytes() == expected.student.to_bytes()
+    same = fdtasil.distill(linear, TOY, "sphere:2", dataset=stored, **SMALL)
+    assert "probe" not in same.queries or same.queries["probe"] == 0
+
+
+def test_a_result_says_why_it_was_not_evaluated(linear):
+    judged = fdtasil.distill(linear, TOY, 0, **QUICK)
+    log = judged.dataset
+    unasked = fdtasil.distill(linear, TOY, 0, **QUICK | {"evaluation_episodes": 0})
+    for found, why in (
+        (fdtasil.distill(None, TOY, 0, dataset=log, **SMALL), "no expert to compare it with"),
+        (fdtasil.distill(linear, None, 0, dataset=log, **SMALL), "no environment to act in"),
+        (unasked, "no episodes were asked for"),
+    ):
+        for told in (repr(found), page_of(found), card_of(found)):
+            assert why in told
+    assert "not evaluated" not in repr(judged)
 
 
 def test_a_twin_is_probed_too(tmp_path):

@@ -166,9 +166,6 @@ def test_what_a_history_does_not_go_with_is_refused(file):
     result = fdtasil.distill(file, TOY, 0, **RUN)
     with pytest.raises(SettingError, match="of a student that sees 19 numbers"):
         fdtasil.History(result.student, 2)
-    dataset = fdtasil.distill(file, TOY, 0, **{**RUN, "history": 1}).dataset
-    with pytest.raises(SettingError, match="history=2 with a dataset that shows 1"):
-        fdtasil.distill(file, None, 3, dataset=dataset, history=2, progress=False)
 
 
 def test_workers_are_given_the_present_alone():
@@ -206,13 +203,53 @@ def test_what_was_recorded_with_a_memory_is_learnt_again_without_asking(history,
     assert (stored.history, stored.remembered, stored.own_size) == (history, 6, N)
 
 
+AGAIN = {"progress": False, "fit": QUICK["fit"], "student": QUICK["student"]}
+
+
+@pytest.mark.fault(291)
+@pytest.mark.parametrize("before", [1, 2, 5])
+@pytest.mark.parametrize("expert", [linear_here, Remembers()], ids=["plain", "remembers"])
+def test_a_recording_is_given_another_history(expert, before):
+    there = fdtasil.distill(expert, TOY, 3, **{**RUN, "history": before}).dataset
+    wanted = fdtasil.distill(expert, TOY, 3, **RUN)
+    again = fdtasil.distill(None, None, dataset=there, history=H, **AGAIN)
+    assert np.array_equal(again.demonstrations.observations, wanted.demonstrations.observations)
+    assert np.array_equal(again.answers.displacements, wanted.answers.displacements)
+    assert again.student.to_bytes() == wanted.student.to_bytes()
+    assert (again.dataset.history, again.steps_seen) == (H, H)
+
+
+@pytest.mark.parametrize("probes", [3, "fresh:3", "jacobian"])
+def test_a_log_is_given_a_history_and_probed(probes, file):
+    recorded = fdtasil.distill(file, TOY, 0, **{**RUN, "history": 1}).demonstrations
+    ends = np.append(recorded.episode[1:] != recorded.episode[:-1], True)
+    log = fdtasil.from_arrays(recorded.observations, recorded.actions, episode_ends=ends)
+    wanted = fdtasil.distill(file, TOY, 0, **RUN).demonstrations.observations
+    found = fdtasil.distill(file, None, probes, dataset=log, history=H, **AGAIN)
+    # A log that knows no bounds has no actions to clip.
+    assert np.array_equal(found.demonstrations.observations[:, :N], wanted[:, :N])
+    assert (found.answers.displacements[:, N:] == 0).all()
+    assert found.student.observation_size == N + PAST
+    there = fdtasil.distill(file, TOY, probes, dataset=log, history=H, horizon=20, **AGAIN)
+    assert np.array_equal(there.demonstrations.observations, wanted)
+    assert there.evaluation is not None
+
+
+def test_a_history_of_recorded_choices_is_what_was_chosen():
+    made = lambda: gymnasium.wrappers.TimeLimit(InForm("box", "choices"), 20)  # noqa: E731
+    expert, alone = in_form(linear_here, "box", "choices"), {**RUN, "history": 1}
+    there = fdtasil.distill(expert, made, 0, **alone).dataset
+    wanted = fdtasil.distill(expert, made, 0, **RUN).demonstrations.observations
+    again = fdtasil.distill(None, None, 0, dataset=there, history=H, **AGAIN)
+    assert np.array_equal(again.demonstrations.observations, wanted)
+    assert set(np.unique(again.demonstrations.observations[:, -M:])) <= {0, 1}
+
+
 @pytest.mark.fault(224)
 def test_another_past_or_memory_than_the_datasets_is_refused(file):
     with_memory = fdtasil.distill(Remembers(), TOY, 0, **RUN).dataset
     with pytest.raises(SettingError, match="remembers nothing, beside states of one"):
         fdtasil.distill(file, TOY, dataset=with_memory, progress=False)
-    with pytest.raises(SettingError, match="history=2 with a dataset that shows 3"):
-        fdtasil.distill(Remembers(), TOY, dataset=with_memory, history=2, progress=False)
     with pytest.raises(SettingError, match="with student_obs"):
         fdtasil.distill(Remembers(), TOY, dataset=with_memory, student_obs=[0], progress=False)
 

@@ -4,19 +4,32 @@ from dataclasses import replace
 
 import numpy as np
 
-from fdtasil.errors import ExpertError, SettingError, first_line
+from fdtasil.errors import ExpertError, first_line
 from fdtasil.experts.expert import Expert
 from fdtasil.experts.memory import OnColumns
 from fdtasil.rollouts.environments import EnvironmentPool
 from fdtasil.rollouts.history import WithHistory, past_size
 from fdtasil.rollouts.remembering import Remembering
 
-__all__ = ["carry"]
+__all__ = ["beside_past", "carry"]
 
 
-def carry(
-    expert: Expert, pool: EnvironmentPool | None, history: int = 1
-) -> tuple[Expert, int, int]:
+def beside_past(expert: Expert, own: int, past: int, remembered: int = 0) -> Expert:
+    """Return an expert that takes its part of observations with a past in them.
+
+    Args:
+        expert: The expert.
+        own: Length of the environment's own observation.
+        past: Length of the past behind it.
+        remembered: Length of the expert's memory, which stands last.
+    """
+    size = own + past + remembered
+    columns = (*range(own), *range(own + past, size))
+    module = expert.module and OnColumns(expert.module, columns)
+    return replace(expert, takes=columns, module=module, observation_size=size, jacobian=None)
+
+
+def carry(expert: Expert, pool: EnvironmentPool, history: int = 1) -> tuple[Expert, int, int]:
     """Let an environment show what an expert would remember, and what a student is to see.
 
     Args:
@@ -27,27 +40,16 @@ def carry(
 
     Returns:
         The expert, which takes its part of them, and the lengths of past and memory.
-
-    Raises:
-        SettingError: If there is no environment, and so nothing to remember.
     """
     memory = expert.memory
     if memory is None and history == 1:
         return expert, 0, 0
-    if pool is None:
-        what = f"history={history}" if memory is None else f"{expert.name}, which has a memory,"
-        raise SettingError(
-            f"{what} without an environment", "one in which it is remembered", "pass env="
-        )
     n, m = pool.boxes.observation_size, pool.boxes.action_size
     past, remembered = past_size(history, n, m), memory.size if memory else 0
     if past:
         layout = pool.spaces.actions
         pool.wrap(lambda environment: WithHistory(environment, history, layout))
-        columns = (*range(n), *range(n + past, n + past + remembered))
-        module = expert.module and OnColumns(expert.module, columns)
-        size = n + past + remembered
-        asked = replace(expert, takes=columns, module=module, observation_size=size, jacobian=None)
+        asked = beside_past(expert, n, past, remembered)
     else:
         asked = expert
     if memory is not None:

@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from fdtasil.results.evaluation import evaluation_rows
+from fdtasil.results.evaluation import evaluation_rows, missing_text
 from fdtasil.results.summary import call_of, run_rows
 
 __all__ = ["card_of"]
@@ -24,8 +24,9 @@ def card_of(result: Any) -> str:
         result: A `Distilled`.
     """
     report, evaluation = result.report, result.evaluation
-    judged = "It was not compared with its expert."
-    if evaluation is not None:
+    if evaluation is None:
+        judged = f"{missing_text(result.settings).capitalize()}."
+    else:
         judged = _table(evaluation_rows(evaluation))
     warnings = [f"- {_cell(text)}" for text in report["warnings"]] or ["- no warnings"]
     return "\n".join(

@@ -39,7 +39,7 @@ from fdtasil.files.storage import (
 from fdtasil.probes.answers import Answers
 from fdtasil.probes.calibration import Calibration
 from fdtasil.results.card import card_of
-from fdtasil.results.evaluation import Evaluation
+from fdtasil.results.evaluation import Evaluation, missing_text
 from fdtasil.results.figures import FIGURES
 from fdtasil.results.page import result_html
 from fdtasil.student.exports import SPACES, export
@@ -97,7 +97,7 @@ class Distilled:
             f"{self.report['env']}: {len(self.demonstrations):,} states, probes "
             f"{self.report['probes']}, {self.report['steps']:,} steps",
             f"queries: {rows_text(self.queries) or 'none'}",
-            "trained without an evaluation" if self.evaluation is None else str(self.evaluation),
+            missing_text(self.settings) if self.evaluation is None else str(self.evaluation),
         ]
         return "\n".join(lines)
 

@@ -7,7 +7,14 @@ from typing import Any
 
 from fdtasil.files.plain import from_plain, to_plain
 
-__all__ = ["Evaluation", "evaluation_rows", "interval_text", "rows_html", "score_text"]
+__all__ = [
+    "Evaluation",
+    "evaluation_rows",
+    "interval_text",
+    "missing_text",
+    "rows_html",
+    "score_text",
+]
 
 
 @dataclass(frozen=True)
@@ -154,6 +161,15 @@ def evaluation_rows(found: Evaluation) -> list[tuple[str, str]]:
     for name, theirs, ours in found.violations:
         rows.append((f"{name} violated", f"{ours:.2%} of the steps, the expert {theirs:.2%}"))
     return rows
+
+
+def missing_text(settings: Mapping[str, Any]) -> str:
+    """Return why a run with these settings has no evaluation."""
+    if settings.get("expert") is None:
+        return "not evaluated: there was no expert to compare it with"
+    if not settings.get("horizon"):
+        return "not evaluated: there was no environment to act in"
+    return "not evaluated: no episodes were asked for"
 
 
 def score_text(share: float | None) -> str:

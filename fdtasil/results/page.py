@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from html import escape
 from typing import Any
 
-from fdtasil.results.evaluation import Evaluation, evaluation_rows, rows_html
+from fdtasil.results.evaluation import Evaluation, evaluation_rows, missing_text, rows_html
 from fdtasil.results.figures import FIGURES
 from fdtasil.results.summary import call_of, run_rows
 
@@ -37,7 +37,7 @@ def page_of(result: Any) -> str:
     warnings = "".join(f'<p class="warning">{escape(text)}</p>' for text in report["warnings"])
     parts = [
         f"<h1>{escape(report['env'])}</h1>",
-        _headline(evaluation),
+        _headline(evaluation, result.settings),
         f"<h2>Warnings</h2>{warnings}" if warnings else "",
         ""
         if evaluation is None
@@ -65,9 +65,9 @@ def result_html(result: Any) -> str:
     return "".join([judged, rows_html(run_rows(result.report)), *pictures])
 
 
-def _headline(evaluation: Evaluation | None) -> str:
+def _headline(evaluation: Evaluation | None, settings: Mapping[str, Any]) -> str:
     if evaluation is None:
-        return "<p>It was not compared with its expert.</p>"
+        return f"<p>{missing_text(settings).capitalize()}.</p>"
     if evaluation.normalized_return is None:
         return "<p>A share of its expert's return means nothing here.</p>"
     share = f"{evaluation.normalized_return:.0%}"

@@ -190,6 +190,7 @@ def read_arguments(
     given: Dataset | None,
     probes: int | str | Probes | None,
     *,
+    can_ask: bool,
     trainer: str | Trainer,
     episodes: int | None,
     horizon: int | None,
@@ -204,13 +205,14 @@ def read_arguments(
     max_queries: int | None,
     device: str,
 ) -> Arguments:
-    """Look at the arguments of `distill`, which say what each is.
+    """Look at the arguments of `distill`, which say what each is; `can_ask`: it has an expert.
 
     Raises:
         SettingError: If one can't be used, or two don't go together.
     """
     defaults = preset_of(preset)
     fit, curved = defaults.fit if fit is None else _checked_fit(fit), callable(student_obs)
+    given = _without_other_answers(given, probes, defaults, fit.order) if can_ask else given
     return Arguments(
         given=given,
         preset=defaults,
@@ -288,19 +290,41 @@ def _source_of(
     if stored is None:
         left_open = preset.calibrates(asked) and not curved
         return asked.with_order(order, None if left_open else FORWARD)
-    asked = replace(  # what was left open was found by a calibration, and is stored
+    asked = _filled_in(asked, stored, order)
+    if asked != stored:
+        raise SettingError(
+            f"probes={asked.describe()!r} with stored answers to {stored.describe()!r}",
+            "the source that is stored, probes=0, or an expert to ask",
+            "leave probes= out, or pass the expert: then it is asked anew",
+        )
+    return _from_store(stored, order, given)
+
+
+def _filled_in(asked: Probes, stored: Probes, order: int) -> Probes:
+    """Return a source with what it leaves open: a calibration found it, and it is stored."""
+    return replace(
         asked,
         radius=stored.radius if asked.radius in (None, "wide") else asked.radius,
         stencil=asked.stencil or stored.stencil,
         match=asked.match or stored.match,
     ).with_order(order)
-    if asked != stored:
-        raise SettingError(
-            f"probes={asked.describe()!r} with stored answers to {stored.describe()!r}",
-            "the source that is stored, or probes=0",
-            "leave probes= out, or record demonstrations of its own",
-        )
-    return _from_store(stored, order, given)
+
+
+def _without_other_answers(
+    given: Dataset | None, spec: int | str | Probes | None, preset: Preset, order: int
+) -> Dataset | None:
+    """Return a dataset without its answers where another source is asked for; warn of it."""
+    stored = given.probes if given is not None and given.answers is not None else None
+    asked = None if spec is None else preset.complete(Probes.parse(spec))
+    if given is None or stored is None or asked is None:
+        return given
+    if _filled_in(asked, stored, order) == stored:
+        return given
+    warn(
+        f"the stored answers to {stored.describe()!r} are not used: the expert is asked anew, "
+        f"{asked.describe()!r}"
+    )
+    return replace(given, probes=None, answers=None)
 
 
 def _source_anew(

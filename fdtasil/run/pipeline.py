@@ -9,6 +9,7 @@ import torch
 from fdtasil.checks import check_count, check_flag, check_path
 from fdtasil.compute import pick_device, torch_settings
 from fdtasil.demonstrations.dataset import Dataset, DatasetLike, load_dataset
+from fdtasil.demonstrations.past import showing
 from fdtasil.demonstrations.trainers import Trainer
 from fdtasil.errors import SettingError, heard_warnings
 from fdtasil.experts.examination import check_first, examine
@@ -120,8 +121,9 @@ def distill(
             dictionary, or a function (B, n) -> (B, k); the expert sees all. Probes move only what
             the student sees.
         history: How many observations the student sees, with the actions between them; more than
-            one for an expert with a memory, or an environment that hides speeds. Probes move the
-            present one. `fdtasil.History` keeps them where the student runs.
+            one for an expert with a memory, or an environment that hides speeds. Of a dataset,
+            those before stand in the rows before. Probes move the present one. `fdtasil.History`
+            keeps them where the student runs.
         keep: Which of the expert's own episodes are learnt from: "all", or "survivors", which
             records others (three at most) in the place of each that the environment ended.
         spread: How far coordinates will go on the machine that stand still in the demonstrations,
@@ -135,7 +137,7 @@ def distill(
         dataset: Train from this instead of recording: a run folder, its demonstrations.npz, or a
             `Dataset`. Stored answers to probes are used as they are. Those of "fresh" and of
             others that resample are asked anew where there is an expert that is cheap, or
-            where `probes` names them.
+            where `probes` names them. Where `probes` names others, an expert is asked those.
         evaluation_episodes: Episodes of the paired evaluation; 0 leaves it out.
         constraints: Name -> function of (N, n) observations and the (N, m) actions taken there,
             positive where the constraint is violated; the evaluation counts these steps.
@@ -185,6 +187,7 @@ def distill(
     arguments = read_arguments(
         given,
         probes,
+        can_ask=expert is not None,
         trainer=trainer,
         episodes=episodes,
         horizon=horizon,
@@ -199,14 +202,17 @@ def distill(
         max_queries=max_queries,
         device=device,
     )
-    chosen, told = pick_device(arguments.device), tell_all(callback)
+    given, told = arguments.given, tell_all(callback)
+    chosen = pick_device(arguments.device)
     with heard_warnings() as notes, open_subject(expert, env, given, history) as subject:
         going_on = asked_anew(folder) if folder is not None and resume is not None else None
         layout = subject.spaces.observations if subject.spaces else None
         student_obs = named(student_obs, layout)
         student_obs = visible(student_obs, subject.observation_size, subject.remembered)
-        if given is not None and subject.pool is not None:
-            given = bounded(given, subject.pool)
+        if given is not None:
+            if subject.pool is not None:
+                given = bounded(given, subject.pool)
+            given = showing(given, history, subject.actions)
         arguments = replace(arguments, given=given, student_obs=student_obs)
         run, bars = arguments.configure(subject, going_on), Progress(progress)
         run.check_spread()

@@ -11,14 +11,14 @@ from fdtasil.checks import spelt
 from fdtasil.demonstrations.dataset import Dataset, warn_of_bounds
 from fdtasil.demonstrations.states import Demonstrations
 from fdtasil.errors import SettingError, warn
-from fdtasil.experts.carrying import carry
+from fdtasil.experts.carrying import beside_past, carry
 from fdtasil.experts.expert import Expert
 from fdtasil.experts.load import ExpertLike, expert_in, load_expert
 from fdtasil.experts.structure import in_spaces
 from fdtasil.rollouts.environments import EnvironmentLike, EnvironmentPool, bounds_text
 from fdtasil.rollouts.history import past_size
 from fdtasil.rollouts.naming import columns_named
-from fdtasil.rollouts.spaces import Layout, Spaces
+from fdtasil.rollouts.spaces import Layout, Spaces, flat_layout
 from fdtasil.student.view import StudentObservation, describe_view
 
 __all__ = ["Subject", "bounded", "history_with", "named", "open_subject", "visible"]
@@ -53,6 +53,11 @@ class Subject:
     spaces: Spaces | None = None
 
     @property
+    def actions(self) -> Layout:
+        """How an action is made of numbers."""
+        return self.spaces.actions if self.spaces else flat_layout(self.action_size)
+
+    @property
     def comparable(self) -> bool:
         """Whether student and expert can be compared in the environment."""
         return self.expert is not None and self.pool is not None
@@ -71,11 +76,11 @@ def open_subject(
         expert: The expert.
         env: The environment.
         given: A dataset.
-        history: How many observations the student sees; those of the dataset where it is given.
+        history: How many observations the student sees.
 
     Raises:
         SettingError: If something is missing that nothing replaces, or the dataset shows another
-            past or memory.
+            memory.
         ExpertError: If the expert can't be opened.
         EnvironmentFault: If the environment can't be used, or does not fit the demonstrations.
     """
@@ -111,7 +116,11 @@ def open_subject(
         if expert is not None:
             found = load_expert(expert, n, m) if pool is None else expert_in(expert, pool)
             found = in_spaces(found, spaces)
-            opened, past, remembered = carry(found, pool, history)
+            if pool is not None:
+                opened, past, remembered = carry(found, pool, history)
+            else:
+                opened, remembered = _without_memory(found), 0
+                opened = beside_past(opened, n, past) if past else opened
             if given is not None and given.remembered != remembered:
                 raise SettingError(
                     f"{opened.name}, which remembers {remembered or 'nothing'}, beside states of "
@@ -121,6 +130,21 @@ def open_subject(
                 )
         size = n + past + remembered
         yield Subject(opened, pool, name, size, m, history, past, remembered, spaces)
+
+
+def _without_memory(expert: Expert) -> Expert:
+    """Return an expert that needs no environment to be asked.
+
+    Raises:
+        SettingError: If it has a memory.
+    """
+    if expert.memory is None:
+        return expert
+    raise SettingError(
+        f"{expert.name}, which has a memory, without an environment",
+        "one in which it is remembered",
+        "pass env=",
+    )
 
 
 def bounded(given: Dataset, pool: EnvironmentPool) -> Dataset:
@@ -159,20 +183,8 @@ def _centred(states: Demonstrations, actions: Layout) -> Demonstrations:
 
 
 def history_with(history: int, given: Dataset | None) -> int:
-    """Return how many observations a student sees: as many as a dataset shows, if one is given.
-
-    Raises:
-        SettingError: If another number is asked for.
-    """
-    if given is None or given.history == history:
-        return history
-    if history == 1:
-        return given.history
-    raise SettingError(
-        f"history={history} with a dataset that shows {given.history} observation(s)",
-        f"history={given.history}",
-        "leave history= out, or record with that history",
-    )
+    """Return how many observations a student sees: as many as a dataset shows, if none is said."""
+    return given.history if given is not None and history == 1 else history
 
 
 def named(

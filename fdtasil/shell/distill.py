@@ -18,7 +18,7 @@ from fdtasil.files.reading import read_plain
 from fdtasil.files.run_format import CHECKPOINTS, COMMAND, check_free, stamped, unstamped
 from fdtasil.files.storage import is_written, remove_file, remove_if_empty, write_bytes
 from fdtasil.results.distilled import Distilled
-from fdtasil.results.evaluation import Evaluation, interval_text, score_text
+from fdtasil.results.evaluation import Evaluation, interval_text, missing_text, score_text
 from fdtasil.results.size import size_text
 from fdtasil.rollouts.wanted import import_module_of
 from fdtasil.run.pipeline import distill
@@ -170,7 +170,7 @@ def _side_by_side(result: Distilled, cloning: Evaluation | None) -> str:
     """Return a table of expert, plain cloning and student."""
     ours = result.evaluation
     if ours is None:
-        return f"{shown(result.report['env'])}: trained without an evaluation"
+        return f"{shown(result.report['env'])}: {missing_text(result.settings)}"
     lines = [
         f"{shown(result.report['env'])}, {ours.episodes} paired episodes of {ours.horizon} steps",
         f"{'':15}{'return':>10}{'normalised':>12}{'95 % interval':>18}{'survival':>10}",
