@@ -35,10 +35,10 @@ def check_expert(
         seed: Of three episodes of the expert, and three of random actions.
 
     Returns:
-        One finding for each check: opening, answers, determinism, batch independence, large
-        batches (as many rows as are asked at once), action bounds, action scale, batch sizes,
-        return (against that of random actions). `problem` is None where the check is passed.
-        An expert that can't answer has the first two at most.
+        One finding for each check: opening, answers, beginning (of a memory), determinism, batch
+        independence, large batches (as many rows as are asked at once), action bounds, action
+        scale, batch sizes, return (against that of random actions). `problem` is None where the
+        check is passed. An expert that can't answer has the first two at most.
 
     Raises:
         EnvironmentFault: If the environment can't be used.

@@ -16,6 +16,7 @@ from fdtasil.experts.load import load_expert
 from fdtasil.files.onnx.recurrent import find_memory
 from fdtasil.results.summary import call_of
 from fdtasil.student.schedule import Schedule
+from fdtasil.testing import check_expert
 
 pytestmark = pytest.mark.usefixtures("no_pictures")
 
@@ -139,6 +140,9 @@ def test_every_row_asked_is_predicted_and_counted(expert):
     result = fdtasil.distill(expert, TOY, 3, **QUICK, progress=False)
     asked, predicted = result.report["queries"], result.report["predicted_queries"]
     assert 0 < asked["remember"] <= predicted["remember"]
+    assert asked["check"] <= predicted["check"]
+    whole = fdtasil.distill(Remembers(), TOY, 3, **QUICK, progress=False)
+    assert whole.queries["check"] == whole.report["predicted_queries"]["check"]
 
 
 @pytest.mark.parametrize("trainer", ["dagger", "dart"])
@@ -295,6 +299,10 @@ def test_a_memory_that_does_not_begin_with_zeros_shows_where_episodes_begin():
     assert load_expert(Settles(), N, 2).memory is not None
     with pytest.raises(ExpertError, match="another memory than zeros"):
         fdtasil.distill(Settles(), TOY, 0, progress=False, **QUICK)
+    for expert, said in ((Settles(), "another memory than zeros"), (Remembers(), "")):
+        (begun,) = (one for one in check_expert(expert, TOY) if one.name == "beginning")
+        assert (begun.problem.found if begun.problem else "").endswith(said)
+        assert bool(begun.problem) == bool(said)
 
 
 class Seats(Remembers):

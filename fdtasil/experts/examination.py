@@ -93,12 +93,20 @@ def check_first(
     """
     check_repeats(pool, starts[0], force=force)
     first = first_observations(pool, [starts[e % len(starts)] for e in range(GATE_STATES)])
-    if expert.memory is not None:
-        size = len(expert.takes or range(first.shape[1])) - expert.memory.size
-        problem = beginning_problem(expert.memory, first[:, :size], expert.name)
-        raise_problems([Finding("beginning", "a memory of zeros", problem)], force=force)
+    raise_problems(_beginning(expert, first), force=force)
     announce = partial(_announce, rows=rows)
     admit_expert(expert, first, pool.boxes, force=force, largest=largest, announce=announce)
+
+
+def _beginning(expert: Expert, first: np.ndarray) -> list[Finding]:
+    """Look at the memory where episodes begin, (B, n) there; an expert without one has none."""
+    memory = expert.memory
+    if memory is None or memory.begin is None:
+        return []
+    size = len(expert.takes or range(first.shape[1])) - memory.size
+    expert.count(2 * len(first), "check")
+    problem = beginning_problem(memory, first[:, :size], expert.name)
+    return [Finding("beginning", problem.found if problem else "a memory of zeros", problem)]
 
 
 def _announce(seconds: float, rows: int) -> None:
@@ -170,7 +178,8 @@ def look_closely(
         noise = [generator(seed, "random actions", episode) for episode in range(episodes)]
         chance = rollout(random_behaviour(pool), pool, starts, length, noise)
     states = own.spread(LOOKED_AT)
-    examined = [*examine_expert(expert, states, boxes), _batch_sizes(expert, states)]
+    begun = _beginning(expert, own.observations[:, 0])
+    examined = [*begun, *examine_expert(expert, states, boxes), _batch_sizes(expert, states)]
     return Looked([opening, *examined], expert, own, chance)
 
 

@@ -127,7 +127,9 @@ class Configuration:
             found["evaluate"] = 2 * self.evaluation_episodes * self.horizon
         elif self.expert is not None:  # on the states of a dataset
             found["check"] = GATE_QUERIES + GATE_STATES
-        if self.remembered:  # each step of the environment
+        if self.remembered:
+            found["check"] += 2 * GATE_STATES  # where episodes begin, with a memory and without
+            # Each step of the environment.
             found["remember"] = found["act"] + found["label"] + found["evaluate"] + _TRIED
         return found
 
