@@ -230,6 +230,17 @@ def test_gravity_is_part_of_a_fingerprint():
         assert isinstance(other_environment(junk, found[0]), list)
 
 
+def test_where_two_long_observations_are_apart_is_told():
+    before = {"seed": 3, "observation": [1.0] * 9, "after": [], "reward": [0.5]}
+    now = before | {"observation": [*[1.0] * 6, 7.0, 1.0, 1.0]}
+    (told,) = other_environment(before, now)
+    assert told == "its first observation from seed 3 was [1.0], is [7.0] at coordinate 6"
+    (told,) = other_environment(before | {"observation": [1.0] * 8}, now)
+    assert told.endswith("had 8 numbers, has 9")
+    for junk in ("x", [None] * 9, [[]] * 9, [10**400] * 9):
+        assert len(other_environment(before | {"observation": junk}, now)) == 1
+
+
 @pytest.mark.fault(180)
 @pytest.mark.parametrize("probes", [0, 2])
 def test_a_run_is_not_gone_on_with_by_another_expert(probes, linear, tmp_path):

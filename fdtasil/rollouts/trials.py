@@ -82,7 +82,7 @@ def differ(ours: np.ndarray, theirs: np.ndarray, moves: np.ndarray | None = None
     else:  # what is computed from those that move has their rounding, at least
         beside = max(_BESIDE * moves.max(), np.finfo(np.float32).eps * sizes[moving].max())
         bound = _SAME * np.minimum(sizes, moves + _STILL * sizes) + beside
-    return bool((np.abs(ours.astype(np.float64) - theirs) > bound).any())
+    return not (np.abs(ours.astype(np.float64) - theirs) <= bound).all()
 
 
 def check_repeats(pool: EnvironmentPool, seed: int, *, force: bool = False) -> None:
@@ -149,6 +149,7 @@ def fingerprint(pool: EnvironmentPool, seed: int) -> dict[str, Any] | None:
     }
 
 
+_LISTED = 4
 _SHOWN = {
     "observation": "its first observation",
     "after": "its observation after one step",
@@ -166,7 +167,7 @@ def other_environment(before: Any, now: Any) -> list[str]:
     if not isinstance(before, dict) or now is None or before.get("seed") != now["seed"]:
         return []  # of a run of an earlier fdtasil, or nothing that could be compared
     return [
-        f"{words} from seed {now['seed']} was {_some(before.get(name))}, is {_some(now[name])}"
+        f"{words} from seed {now['seed']} {_changed(before.get(name), now[name])}"
         for name, words in _SHOWN.items()
         if _apart(before.get(name), now[name])
     ]
@@ -180,9 +181,22 @@ def _apart(before: Any, now: list[float]) -> bool:
         return True
 
 
+def _changed(before: Any, now: list[float]) -> str:
+    """Return what two that are apart are, and where they are farthest apart if they are long."""
+    if isinstance(before, list) and len(before) != len(now):
+        return f"had {len(before)} numbers, has {len(now)}"
+    if len(now) <= _LISTED or not isinstance(before, list):
+        return f"was {_some(before)}, is {_some(now)}"
+    try:
+        place = int(np.abs(np.subtract(before, now, dtype=np.float64)).argmax())
+    except (TypeError, ValueError, OverflowError):  # a file that was changed
+        place = 0
+    return f"was {_some(before[place])}, is {_some(now[place])} at coordinate {place}"
+
+
 def _some(values: Any) -> str:
     listed = values if isinstance(values, list) else [values]
-    return f"[{', '.join(map(str, listed[:4]))}{', ...' * (len(listed) > 4)}]"
+    return f"[{', '.join(map(str, listed[:_LISTED]))}{', ...' * (len(listed) > _LISTED)}]"
 
 
 def stages_of(
