@@ -311,6 +311,17 @@ FAULTS = {
         286: "an action that is no number, which a history remembers for ever",
         291: "a recording whose student is to see more or less of the past",
         292: "stored answers beside an expert that is to be asked for others",
+        293: "files of an earlier run beside the next one on the hub",
+        294: "movement beside an offset, of which float32 keeps little",
+        295: "a memory below a wrapper of this library",
+        296: "a model card that was completed by hand",
+        297: "deviations that were said, of a dataset whose next student does not hear of them",
+        298: "a student that sees through a function, judged or handed on without it",
+        299: "an answer that is rounded beyond a bound",
+        300: "an export of large actions with a small range, refused for rounding alone",
+        301: "constraints of a run that evaluates nothing",
+        302: "choices of a log, written as whole numbers",
+        303: "a finished run with checkpoints that could not be dropped",
     },
 }
 

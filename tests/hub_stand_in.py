@@ -150,7 +150,11 @@ class Handler(BaseHTTPRequestHandler):
             for line in lines
             if line["key"] == "file"
         }
-        sha = self.stand_in.repositories[name].commit(files)
+        gone = {line["value"]["path"] for line in lines if line["key"] == "deletedFile"}
+        repository = self.stand_in.repositories[name]
+        before = repository.commits.get(repository.branches.get("main"), {})
+        kept = {path: data for path, data in before.items() if path not in gone}
+        sha = repository.commit({**kept, **files})
         self._answer({"commitUrl": f"{self.stand_in.endpoint}/{name}", "commitOid": sha})
 
     def _in_trouble(self, path):

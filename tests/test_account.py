@@ -74,3 +74,6 @@ def test_a_budget_may_be_used_up_to_the_last_row(monkeypatch):
     run.account.check_budget(10**9, None)
     with pytest.raises(SettingError, match="50 queries are asked, and 11 more are due"):
         run.account.check_budget(11, 60)
+    run.account.check_budget(4, 60, later=6)
+    with pytest.raises(SettingError, match="50 queries are asked, and 11 more are due"):
+        run.account.check_budget(4, 60, later=7)

@@ -3,6 +3,8 @@
 import importlib
 import io
 import json
+import re
+import warnings
 from dataclasses import replace
 
 import numpy as np
@@ -75,7 +77,7 @@ def test_stored_probes_can_be_left_or_added(run, linear, tmp_path):
     plain = fdtasil.distill(dataset=run, probes=0, **SMALL)
     assert plain.history[0]["derivative_error"] == 0
     bare = plain.save(tmp_path / "bare")
-    with pytest.raises(SettingError, match="without an expert"):
+    with pytest.raises(SettingError, match="and no expert"):
         fdtasil.distill(dataset=Dataset.from_bytes(_without_answers(run)), **SMALL)
     added = fdtasil.distill(linear, dataset=Dataset.from_bytes(_without_answers(run)), **SMALL)
     assert added.queries["probe"] == 10 * len(added.demonstrations)
@@ -266,6 +268,62 @@ def test_a_result_says_why_it_was_not_evaluated(linear):
         for told in (repr(found), page_of(found), card_of(found)):
             assert why in told
     assert "not evaluated" not in repr(judged)
+
+
+@pytest.mark.fault(294)
+def test_a_log_whose_movement_float32_rounds_away_is_warned_of():
+    random = np.random.default_rng(0)
+    states = random.standard_normal((50, 3))
+    actions = np.tanh(states[:, 1:2])
+    clock = states + np.float64([1.7e9, 0, 0])
+    with pytest.warns(FdtasilWarning, match="float32 rounds away how 1 of the 3 .*number 0 moves"):
+        fdtasil.from_arrays(clock, actions)
+    with pytest.raises(SettingError, match="rounds away how 1 of the 1 observations"):
+        fdtasil.from_arrays(clock[:, :1], actions)
+    assert fdtasil.from_arrays(states + 100, actions).sizes == (3, 1)
+
+
+@pytest.mark.fault(294)
+@pytest.mark.parametrize(("deviation", "told"), [(1.0, True), (0.02, False), (10.0, False)])
+def test_movement_beside_an_offset_that_is_left_out_is_warned_of(deviation, told, recwarn):
+    """Of 4e5, float32 has steps of 0.03: less than that is no movement, and more is normalised."""
+    states = np.random.default_rng(0).standard_normal((200, 2))
+    actions = np.tanh(states[:, 1:])
+    states[:, 0] = 4e5 + deviation * states[:, 0]
+    log = fdtasil.from_arrays(states.astype(np.float32), actions)
+    with warnings.catch_warnings(record=True) as said:
+        warnings.simplefilter("always")
+        fdtasil.distill(dataset=log, probes=0, **SMALL)
+    found = [
+        str(one.message) for one in said if "float32 has beside their offset" in str(one.message)
+    ]
+    assert len(found) == told
+    if told:
+        assert re.search(r"1 coordinates .*\(0: (0\.9|1).*; number 0 beside 4000", found[0])
+
+
+@pytest.mark.fault(302)
+def test_whole_numbers_of_a_log_may_be_choices():
+    states = np.random.default_rng(0).standard_normal((50, 3))
+    for chosen in ((states[:, :1] > 0), (states[:, :1] > 0).astype(int)):
+        with pytest.warns(FdtasilWarning, match=r"np\.eye\(2\)\[chosen\] - 1 / 2"):
+            fdtasil.from_arrays(states, chosen)
+    fdtasil.from_arrays(states, np.arange(50)[:, None])  # a position in steps of a motor
+
+
+def test_who_has_neither_answers_nor_an_expert_is_told_so(quick):
+    log = fdtasil.from_arrays(quick.demonstrations.observations, quick.demonstrations.actions)
+    with pytest.raises(SettingError, match="a dataset without answers to probes, and no expert"):
+        fdtasil.distill(dataset=log, **SMALL)
+
+
+@pytest.mark.fault(301)
+def test_constraints_of_a_run_that_evaluates_nothing_are_refused(linear, quick):
+    limits = {"constraints": {"a": lambda x, u: x[:, 0]}}
+    with pytest.raises(SettingError, match="constraints= and no evaluation"):
+        fdtasil.distill(linear, TOY, 0, **(QUICK | limits | {"evaluation_episodes": 0}))
+    with pytest.raises(SettingError, match="constraints= without an expert"):
+        fdtasil.distill(None, TOY, dataset=quick.dataset, **limits, **SMALL)
 
 
 def test_a_twin_is_probed_too(tmp_path):

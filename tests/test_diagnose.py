@@ -411,7 +411,7 @@ def test_a_student_that_falls_at_once_is_not_near():
     assert found.ended == 4
     assert "at least: 4 ended before the expert's" in str(found)
     assert found.stability.ended[-1] == 8  # both of each episode
-    assert "8 episodes ended early" in str(found)
+    assert "(8 ended early, of two from each start)" in str(found)
     assert 0 < found.stability.reached(1e-3) < found.stability.reached(0.1)
     assert found.stability.reached(3) is None  # from one bound to the other is 2
 

@@ -150,3 +150,43 @@ def test_a_planner_without_an_answer_goes_on_as_before(tmp_path):
     fdtasil.render({"planner": fails}, Watched, tmp_path / "f.gif", horizon=30)
     assert len(acted) == 3 + HOLD
     assert np.array_equal(acted, np.full((len(acted), 2), 0.5))
+
+
+def test_a_gif_keeps_the_pace_that_viewers_show(tmp_path):
+    class Fast(Drawn):
+        metadata = {"render_modes": ["rgb_array"], "render_fps": 125}  # noqa: RUF012
+
+    for every, seconds in ((1, 0.32), (2, 0.32)):
+        file = fdtasil.render({"p": push}, Fast, tmp_path / "f.gif", horizon=40, every=every)
+        film, shown = Image.open(file), []
+        for number in range(film.n_frames):
+            film.seek(number)
+            shown.append(film.info["duration"])
+        assert min(shown) >= 20
+        assert sum(shown[:-1]) == pytest.approx(1000 * seconds, abs=20)
+
+
+def test_where_an_episode_ends_is_shown(tmp_path):
+    drawn = []
+
+    class Counted(Drawn):
+        def __init__(self):
+            super().__init__(wall=0.9)
+
+        def reset(self, *, seed=None, options=None):
+            self.time = 0
+            return super().reset(seed=seed, options=options)
+
+        def step(self, action):
+            self.time += 1
+            answer = super().step(action)
+            self.ended = self.time if answer[2] else None
+            return answer
+
+        def render(self):
+            drawn.append((self.time, getattr(self, "ended", None)))
+            return super().render()
+
+    fdtasil.render({"pushed": push}, Counted, tmp_path / "f.gif", horizon=60, every=7)
+    time, ended = drawn[-1]
+    assert time == ended

@@ -220,6 +220,39 @@ COMMANDED = {
 }
 
 
+@pytest.mark.fault(297)
+@pytest.mark.parametrize("probes", [0, 3, "fresh:3"])
+@pytest.mark.parametrize("spread", [{4: 0.58}, "bounds"])
+def test_a_dataset_keeps_the_deviations_that_were_said(spread, probes, tmp_path):
+    run = {"fit": fdtasil.Fit(steps=30), "student": fdtasil.Mlp(8), "progress": False}
+    recorded = {"episodes": 1, "horizon": 20, "evaluation_episodes": 2}
+    first = fdtasil.distill(follows, Commanded, probes, spread=spread, **recorded, **run)
+    first.save(tmp_path / "run")
+    assert first.dataset.spread.to_json() == first.settings["spread"]
+    again = {"dataset": tmp_path / "run", "horizon": 20, "evaluation_episodes": 2}
+    for said in ({}, {"spread": spread}):
+        # The probes too: what was asked once and what is asked anew are answered alike.
+        same = fdtasil.distill(follows, Commanded, probes, **again, **said, **run)
+        assert same.settings["spread"] == first.settings["spread"]
+        assert same.student.to_bytes() == first.student.to_bytes()
+    assert same.evaluation == first.evaluation
+    shrunk = fdtasil.shrink(
+        first,
+        follows,
+        Commanded,
+        sizes=[8],
+        cloned=False,
+        evaluation_episodes=2,
+        keep=0.01,
+        fit=run["fit"],
+        progress=False,
+    )
+    assert shrunk.candidates[0].normalized_return is not None
+    if probes == 3:
+        with pytest.raises(SettingError, match="spread= with answers that are stored"):
+            fdtasil.distill(follows, Commanded, **again, spread={4: 0.1}, **run)
+
+
 @pytest.mark.parametrize("spread", [{4: 0.58}, "4:0.58", "bounds"])
 def test_one_demonstration_teaches_every_command(spread):
     result = fdtasil.distill(follows, Commanded, "fresh", spread=spread, **COMMANDED)

@@ -322,3 +322,24 @@ def test_what_a_student_can_not_see_is_said_where_it_runs(quick):
         policy.predict(np.zeros(4))
     with pytest.raises(SettingError, match="is a dict"):
         student.predict({"a": 1})
+
+
+@pytest.mark.fault(298)
+def test_a_file_that_sees_through_a_function_is_not_judged_without_it(file, tmp_path):
+    seen, run = lambda rows: 3 * rows, {**RUN, "history": 1}
+    result = fdtasil.distill(file, TOY, 0, student_obs=seen, **run)
+    written = result.export(tmp_path / "s.onnx")
+    again = {"episodes": 2, "horizon": 20, "progress": False}
+    for judge in (fdtasil.evaluate, fdtasil.diagnose):
+        with pytest.raises(SettingError, match="sees through the function .*file does not hold"):
+            judge(written, file, TOY, **again)
+    found = fdtasil.evaluate(written, file, TOY, student_obs=seen, **again)
+    assert found.student_return == pytest.approx(result.evaluation.student_return, rel=1e-3)
+
+
+def test_paths_are_compared_without_their_past(file):
+    run = {"episodes": 2, "horizon": 20, "progress": False}
+    law = lambda rows: 0.9 * rows @ GAIN.T  # noqa: E731
+    gaps = {fdtasil.evaluate(law, file, TOY, history=h, **run).imitation_gap for h in (1, 2, 5)}
+    assert max(gaps) == pytest.approx(min(gaps), rel=1e-6)
+    assert min(gaps) > 0

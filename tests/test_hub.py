@@ -3,6 +3,8 @@
 import hashlib
 import json
 import os
+import re
+import shutil
 import socket
 import sys
 import time
@@ -474,6 +476,47 @@ def test_a_second_push_is_a_second_commit_and_changes_no_access(writable, quick_
         assert done.returncode == 0, done.stderr
     assert len(writable.repositories["me/toy"].commits) == 2
     assert len([path for path in writable.asked() if path == "/api/repos/create"]) == 1
+
+
+@pytest.mark.fault(293)
+def test_no_file_of_an_earlier_run_stays_beside_the_next(writable, quick_folder, inside):
+    assert inside("push", quick_folder, "me/toy", "--demonstrations").returncode == 0
+    repository = writable.repositories["me/toy"]
+    repository.commit({**pushed(writable), "LICENSE": b"mine", "figures/own.svg": b"mine"})
+    done = inside("push", quick_folder, "me/toy")
+    assert done.returncode == 0, done.stderr
+    files = pushed(writable)
+    assert (
+        not {"demonstrations.npz", "config.json", "progress.csv", "manifest.json"} & files.keys()
+    )
+    assert {"LICENSE", "figures/own.svg", *CARD} <= files.keys()
+    for name in ("demonstrations.npz", "manifest.json"):
+        assert re.search(rf"removed  {name}, of an earlier run", done.stdout)
+    assert "LICENSE" not in done.stdout
+
+
+@pytest.mark.fault(293)
+def test_files_of_a_repository_that_no_run_was_sent_to_stay(writable, quick_folder, inside):
+    writable.repositories["me/bert"] = Repository("private", TOKEN)
+    writable.repositories["me/bert"].commit({"config.json": b"{}", "README.md": b"mine"})
+    assert inside("push", quick_folder, "me/bert").returncode == 0
+    assert pushed(writable, "me/bert")["config.json"] == b"{}"
+
+
+def test_a_private_repository_does_not_become_public(writable, quick_folder, inside):
+    assert inside("push", quick_folder, "me/toy").returncode == 0
+    refused = inside("push", quick_folder, "me/toy", "--public")
+    assert refused.returncode == 2
+    assert "me/toy is there already, and private" in refused.stderr
+    assert refused.stdout == ""
+    assert len(writable.repositories["me/toy"].commits) == 1
+
+
+def test_a_card_that_was_completed_by_hand_is_sent(writable, quick_folder, inside, tmp_path):
+    shutil.copytree(quick_folder, tmp_path / "run")
+    (tmp_path / "run" / "README.md").write_text("license: mit")
+    assert inside("push", tmp_path / "run", "me/toy").returncode == 0
+    assert pushed(writable)["README.md"] == b"license: mit"
 
 
 def test_nothing_is_pushed_to_a_public_repository_by_accident(writable, quick_folder, inside):

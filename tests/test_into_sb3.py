@@ -120,3 +120,18 @@ def test_another_environment_is_refused():
     some = fdtasil.distill(law, TOY, 0, student_obs=[0, 1], **QUICK)
     with pytest.raises(ExportError, match="whole observation"):
         some.to_sb3(InForm(), "SAC")
+
+
+@pytest.mark.fault(298)
+@pytest.mark.parametrize("seen", [[4, 3, 2, 1, 0], lambda rows: 3 * rows], ids=["turned", "grown"])
+def test_a_student_that_sees_another_thing_is_no_agent(seen):
+    result = fdtasil.distill(law, TOY, 0, student_obs=seen, **QUICK)
+    with pytest.raises(ExportError, match="sees another thing than the observation"):
+        result.to_sb3(InForm(), "SAC")
+
+
+def test_a_student_of_all_columns_is_an_agent():
+    result = fdtasil.distill(law, TOY, 0, student_obs=range(5), **QUICK)
+    rows = result.demonstrations.observations
+    answers = result.to_sb3(InForm(), "SAC").predict(rows, deterministic=True)[0]
+    assert answers == pytest.approx(result.student.predict(rows)[0], abs=1e-5)

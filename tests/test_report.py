@@ -2,6 +2,7 @@
 
 import pickle
 import re
+import shutil
 from html.parser import HTMLParser
 
 import gymnasium
@@ -10,7 +11,7 @@ import pytest
 from conftest import QUICK, TOY, mlp_onnx
 
 import fdtasil
-from fdtasil.errors import FdtasilWarning
+from fdtasil.errors import FdtasilWarning, StorageError
 from fdtasil.results.card import card_of
 from fdtasil.results.page import page_of
 from fdtasil.results.summary import call_of
@@ -176,3 +177,42 @@ def test_an_environment_that_is_more_than_its_id_is_left_to_the_reader():
 
 def make_pendulum():
     return gymnasium.make("Pendulum-v1", g=3.0)
+
+
+@pytest.mark.fault(296)
+def test_a_card_that_was_completed_by_hand_is_no_damage(quick_folder, tmp_path):
+    shutil.copytree(quick_folder, tmp_path / "run")
+    card = tmp_path / "run" / "README.md"
+    card.write_text(card.read_text() + "license: mit")
+    assert fdtasil.Distilled.load(tmp_path / "run").evaluation is not None
+    (tmp_path / "run" / "report.json").write_text("{}")
+    with pytest.raises(StorageError, match=r"report\.json changed after writing"):
+        fdtasil.Distilled.load(tmp_path / "run")
+
+
+def test_a_card_says_no_more_than_what_was_done(linear, quick):
+    cloned = fdtasil.distill(linear, TOY, 0, **(QUICK | {"evaluation_episodes": 0, "history": 2}))
+    card = card_of(cloned)
+    assert "Nobody has judged it" in card
+    assert "It was judged" not in card
+    assert "plain behaviour cloning" in card
+    assert "around them" not in card
+    assert "`obs`, (rows, 12) float32 (0:5 now, then for each of 1 steps before" in card
+    assert "It was judged in this environment" in card_of(quick)
+    assert "and its reactions around them" in card_of(quick)
+
+
+@pytest.mark.fault(266)
+def test_the_call_of_the_card_says_what_an_expert_was_opened_with(tmp_path):
+    file = mlp_onnx(tmp_path / "e.onnx")
+    opened = fdtasil.load_expert(file, output="actions")
+    card = card_of(fdtasil.distill(opened, TOY, 0, **QUICK))
+    assert re.search(r"expert = \.\.\.  # .*e\.onnx, opened with output='actions'", card)
+
+
+@pytest.mark.fault(266)
+def test_the_call_of_the_card_leaves_a_length_that_grew_to_grow_again(linear):
+    run = {"episodes": 50, "horizon": 40, "evaluation_episodes": 0, "student": fdtasil.Mlp(4)}
+    result = fdtasil.distill(linear, TOY, 0, **run, progress=False)
+    assert result.report["steps"] > 4000
+    assert "Fit(batch_size" in call_of(result.settings, 1)

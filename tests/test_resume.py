@@ -261,3 +261,16 @@ def test_a_warning_is_not_said_again_when_probes_are_asked_on(tmp_path, monkeypa
         warnings.simplefilter("ignore")
         result = fdtasil.distill(law, TOY, resume=tmp_path / "run", **run)
     assert result.report["warnings"] == whole.report["warnings"]
+
+
+@pytest.mark.fault(303)
+def test_a_run_whose_checkpoints_could_not_be_dropped_is_finished(expert, tmp_path, monkeypatch):
+    run = {**QUICK, "progress": False}
+    first = fdtasil.distill(expert, TOY, 2, out=tmp_path / "run", **run)
+    left = tmp_path / "run" / "checkpoints"
+    left.mkdir()
+    (left / "config.json").write_bytes((tmp_path / "run" / "config.json").read_bytes())
+    told = []
+    again = fdtasil.distill(expert, TOY, 2, resume=tmp_path / "run", callback=told.append, **run)
+    assert told == []
+    assert again.student.to_bytes() == first.student.to_bytes()

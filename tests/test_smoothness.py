@@ -103,3 +103,35 @@ def test_it_is_part_of_the_evaluation():
     )
     assert 0 <= choices.roughness <= 1
     assert choices.high_frequency is None
+
+
+class Mixed(gymnasium.Env):
+    """A number that is a fast or a slow signal, beside a choice that is made anew or kept."""
+
+    observation_space = gymnasium.spaces.Box(-1, 1, (1,), np.float32)
+    action_space = gymnasium.spaces.Dict(
+        {"b": gymnasium.spaces.Discrete(2), "u": gymnasium.spaces.Box(-1, 1, (1,))}
+    )
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.time = 0
+        return np.zeros(1, np.float32), {}
+
+    def step(self, action):
+        self.time += 1
+        return np.float32([self.time % 2]), 1.0, False, False, {}
+
+
+def test_a_mixed_action_is_as_rough_as_its_parts():
+    """The choice of two scores changes never or always, the number by half of its range."""
+    for (b, u), rough, fast in (((0, 1), 0.5, 1.0), ((1, 0), 0.5, None), ((1, 1), 1.0, 1.0)):
+
+        def law(rows, b=b, u=u):
+            odd = 2 * rows - 1
+            return np.concatenate([b * odd, -b * odd, 0.5 * u * odd], axis=1)
+
+        made = lambda: gymnasium.wrappers.TimeLimit(Mixed(), 20)  # noqa: E731
+        found = fdtasil.evaluate(law, law, made, episodes=2, progress=False)
+        assert found.roughness == pytest.approx(rough)
+        assert found.high_frequency == (fast if fast is None else pytest.approx(fast))

@@ -66,6 +66,44 @@ def test_a_wrapper_that_remembers_is_refused_by_its_name(name, around, linear, n
         assert f"leave {name} out" in error.value.next_step
 
 
+class Leaks(Integrator):
+    """Counts on over episodes."""
+
+    count = 0
+
+    def reset(self, *, seed=None, options=None):
+        self.count += 1
+        observation, info = super().reset(seed=seed)
+        return self.seen(observation), info
+
+    def step(self, action):
+        observation, *rest = super().step(action)
+        return self.seen(observation), *rest
+
+    def seen(self, observation):
+        return observation + self.count
+
+
+class LeaksInParts(Leaks):
+    def __init__(self):
+        super().__init__()
+        self.observation_space = gymnasium.spaces.Dict({"all": self.observation_space})
+
+    def seen(self, observation):
+        return {"all": observation + self.count}
+
+
+@pytest.mark.fault(295)
+@pytest.mark.parametrize(
+    ("made", "more"), [(Leaks, {}), (Leaks, {"history": 2}), (LeaksInParts, {})]
+)
+def test_a_wrapper_of_this_library_is_not_blamed(made, more):
+    law = lambda rows: np.zeros((len(rows), 2), np.float32)  # noqa: E731
+    with pytest.raises(EnvironmentFault, match=f"{made.__name__} remembers earlier") as error:
+        fdtasil.distill(law, made, 0, **QUICK, **more)
+    assert f"let reset() of {made.__name__} clear all" in error.value.next_step
+
+
 @pytest.mark.fault(175)
 @pytest.mark.parametrize("name", ["NormalizeReward", "NormalizeObservation"])
 def test_the_next_steps_of_a_wrapper_that_remembers_work(name):

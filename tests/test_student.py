@@ -231,3 +231,31 @@ def test_the_copy_in_numpy_follows_every_weight():
     with torch.no_grad():
         student.network[-1].bias = torch.nn.Parameter(student.network[-1].bias + 1)
     assert student.predict(rows[0])[0] == pytest.approx(student.predict(rows)[0][0], abs=1e-5)
+
+
+@pytest.mark.fault(299)
+def test_no_answer_is_rounded_beyond_its_bounds():
+    low = np.repeat(np.round(np.arange(-2, 0, 0.1), 1), 20).astype(np.float32)
+    high = np.tile(np.round(np.arange(0.1, 2.1, 0.1), 1), 20).astype(np.float32)
+    low, high = np.append(low, [299.99997, 1e8]), np.append(high, [300.1, 1e8 + 8])
+    low, high = low.astype(np.float32), high.astype(np.float32)
+    student = Student(
+        Mlp(()), np.zeros(1), np.ones(1), low, high, torch.Generator().manual_seed(0)
+    )
+    with torch.no_grad():
+        student.network[0].weight.fill_(100.0)
+    rows = np.float32([[-1], [1]])
+    for answers in (student.act(rows), student(torch.from_numpy(rows)).detach().numpy()):
+        assert (answers >= low).all()
+        assert (answers <= high).all()
+        assert answers[0] == pytest.approx(low, rel=1e-6)
+        assert answers[1] == pytest.approx(high, rel=1e-6)
+
+
+@pytest.mark.fault(300)
+@pytest.mark.parametrize("suffix", [".c", ".onnx", ".py"])
+def test_what_float32_rounds_of_an_action_is_no_difference(suffix):
+    low, high = np.float32([299]), np.float32([301])
+    random, states = torch.Generator().manual_seed(0), np.random.default_rng(0)
+    student = Student(Mlp((16, 16)), np.zeros(4), np.ones(4), low, high, random).eval()
+    assert export(student, states.standard_normal((500, 4)).astype(np.float32), {}, f"s{suffix}")

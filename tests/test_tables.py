@@ -11,7 +11,7 @@ from fdtasil.errors import SettingError
 from fdtasil.files.onnx.export import export_module
 from fdtasil.files.onnx.graph import LAYERS, can_write
 from fdtasil.probes.source import DIRECTIONS, Probes
-from fdtasil.results.figures import FIGURES
+from fdtasil.results.figures import FIGURES, _cumulative_steps
 from fdtasil.student.architectures import ACTIVATIONS, ARCHITECTURES, Mlp
 from fdtasil.student.exports import EXPORTS
 from fdtasil.student.policy import Student
@@ -138,3 +138,9 @@ def test_the_students_own_graph_is_small_and_can_be_quantised(activation, tmp_pa
     quantize_dynamic(plain, small)
     answers = fdtasil.load_expert(small, 5, 2).ask(ROWS, "act")
     assert np.abs(answers - student.act(ROWS)).max() < 0.1
+
+
+def test_steps_are_counted_on_over_rounds_of_any_length():
+    entries = [(0, 10), (0, 20), (1, 50), (2, 20), (2, 100), (3, 100)]
+    history = [{"round": number, "step": step} for number, step in entries]
+    assert _cumulative_steps(history) == [10, 20, 70, 90, 170, 270]

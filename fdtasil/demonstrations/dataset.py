@@ -4,7 +4,7 @@ import io
 import json
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
@@ -17,9 +17,11 @@ from fdtasil.files.arrays import arrays_from_bytes
 from fdtasil.files.border import reads
 from fdtasil.files.plain import as_kind
 from fdtasil.files.reading import from_json, read_plain
+from fdtasil.files.run_format import check_finished
 from fdtasil.files.storage import is_written, verify
 from fdtasil.probes.answers import Answers
 from fdtasil.probes.source import Probes
+from fdtasil.probes.spread import Spread
 from fdtasil.rollouts.history import past_size
 from fdtasil.rollouts.spaces import Spaces
 
@@ -43,6 +45,8 @@ class Dataset:
         history: How many observations the student sees; behind the environment's own stand those
             before it, with the actions then.
         remembered: Length of what the expert remembered there, which stands last.
+        spread: How far coordinates were said to go that hardly move in the states; the answers
+            are of probes that go so far, and a student's normaliser divides by it.
     """
 
     demonstrations: Demonstrations
@@ -54,6 +58,7 @@ class Dataset:
     spaces: Spaces | None = None
     history: int = 1
     remembered: int = 0
+    spread: Spread = field(default_factory=lambda: Spread({}))
 
     def __repr__(self) -> str:
         """Return a line, not the arrays."""
@@ -91,7 +96,7 @@ class Dataset:
         (N, k) int32, `values` (N, k, p, m) float32 and `gains` (P,) float64 as in `Answers` (one
         `gain` () in version 1); and
         `about`, JSON text as bytes: version, environment, probes, and where they are not the
-        usual ones spaces, history and remembered.
+        usual ones spaces, history, remembered and spread.
         """
         arrays: dict[str, Any] = dict(vars(self.demonstrations))
         arrays |= {"low": self.low, "high": self.high}
@@ -106,6 +111,8 @@ class Dataset:
             about["spaces"] = self.spaces.to_json()
         if self.history > 1 or self.remembered:
             about |= {"history": self.history, "remembered": self.remembered}
+        if (spread := self.spread.to_json()) is not None:
+            about["spread"] = spread
         arrays["about"] = np.frombuffer(json.dumps(about).encode(), np.uint8)
         target = io.BytesIO()
         np.savez(target, **arrays)
@@ -146,6 +153,7 @@ def load_dataset(source: DatasetLike) -> Dataset:
         )
     path = check_path("dataset", source)
     file = path / "demonstrations.npz" if path.is_dir() else path
+    check_finished(path)
     try:
         if path.is_dir() and is_written(path):
             data = verify(path, [file.name])[file.name]
@@ -328,7 +336,8 @@ def _read(arrays: Mapping[str, np.ndarray]) -> Dataset:
         as_kind(int, about.get(name, usual), name)
         for name, usual in (("history", 1), ("remembered", 0))
     )
-    behind = spaces, history, remembered
+    spread = Spread.from_json(about.get("spread"), demonstrations.observations.shape[-1])
+    behind = spaces, history, remembered, spread
     found = Dataset(demonstrations, _probes(spec, answers), answers, *bounds, environment, *behind)
     n, m = found.sizes
     good = history >= 1 and remembered >= 0 and found.own_size >= 1

@@ -17,6 +17,7 @@ from fdtasil.files.names import check_no_links, stays_inside
 from fdtasil.files.reading import from_json, read_plain
 from fdtasil.files.storage import remove_folder
 from fdtasil.rollouts.flattening import bounds_of, unbounded
+from fdtasil.rollouts.narrowing import Narrowing
 from fdtasil.rollouts.spaces import Mismatch, Spaces, UnknownSpace
 
 if TYPE_CHECKING:
@@ -66,12 +67,15 @@ def _dataset_of(source: "str | minari.MinariDataset", minari: Any) -> Dataset:
         data = source
         _check_files(Path(data.storage.data_path))
     spaces = _spaces_of(data)
+    narrowing = Narrowing(spaces.observations.size, str(data.spec.dataset_id))
     episodes = [
-        _read(number, episode, spaces) for number, episode in enumerate(data.iterate_episodes())
+        _read(number, episode, spaces, narrowing)
+        for number, episode in enumerate(data.iterate_episodes())
     ]
     if not episodes:
         raise StorageError(f"{source!r} has no episodes", "at least one", "choose another dataset")
     states = Demonstrations.joined(episodes)
+    narrowing.judge_a_log()
     ends = bounds_of(data.action_space, spaces.actions)
     low, high = (np.asarray(unbounded(bound), np.float32) for bound in ends)
     name = data.env_spec.id if data.env_spec else data.spec.dataset_id
@@ -193,14 +197,16 @@ def to_minari(dataset: Dataset, dataset_id: str, **about: str) -> "minari.Minari
         ) from error
 
 
-def _read(number: int, episode: Any, spaces: Spaces) -> Demonstrations:
+def _read(number: int, episode: Any, spaces: Spaces, narrowing: Narrowing) -> Demonstrations:
     steps, n, m = len(episode.rewards), spaces.observations.size, spaces.actions.size
     try:
         taken = spaces.actions.centred(spaces.actions.rows(episode.actions))
-        observations = spaces.observations.rows(episode.observations)
+        wide = spaces.observations.rows(episode.observations)
     except Mismatch as mismatch:
         raise ValueError(f"episode {number} has {mismatch}") from None
-    taken, observations = (part.astype(np.float32)[:steps] for part in (taken, observations))
+    taken, observations = (part.astype(np.float32)[:steps] for part in (taken, wide))
+    if steps:
+        narrowing.see(wide[:steps], observations)
     infos = episode.infos or {}
     labels = np.asarray(infos.get(EXPERT_ACTION, taken), np.float32)[:steps]
     rewards = np.asarray(episode.rewards, np.float64)

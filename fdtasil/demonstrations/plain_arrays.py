@@ -7,11 +7,14 @@ import numpy as np
 
 from fdtasil.demonstrations.dataset import Dataset, check_dataset, warn_of_bounds
 from fdtasil.demonstrations.states import Demonstrations
-from fdtasil.errors import SettingError, shown, warn
+from fdtasil.errors import SettingError, in_one_line, shown, warn
 from fdtasil.rollouts.flattening import unbounded
+from fdtasil.rollouts.narrowing import Narrowing
 from fdtasil.rollouts.spaces import to_numpy
 
 __all__ = ["from_arrays"]
+
+_CHOICES = 20  # different whole numbers at most, that may be those of choices
 
 
 def from_arrays(
@@ -50,7 +53,8 @@ def from_arrays(
     """
     if isinstance(observations, list | tuple) and observations and np.ndim(observations[0]) == 2:
         observations, actions, episode_ends = _joined(observations, actions, episode_ends)
-    rows, labels = _numbers("observations", observations), _numbers("actions", actions)
+    wide, labels = _numbers("observations", observations), _numbers("actions", actions)
+    rows = np.ascontiguousarray(wide, np.float32)
     if rows.ndim != 2 or labels.ndim != 2 or len(rows) != len(labels) or not len(rows):
         raise SettingError(
             f"observations of shape {rows.shape} and actions of shape {labels.shape}",
@@ -58,20 +62,34 @@ def from_arrays(
             "reshape them; episodes stand one behind the other",
         )
     count, m = labels.shape
-    wide = np.full(m, np.inf)
-    least, most = _bound("low", low, -wide, m), _bound("high", high, wide, m)
+    none = np.full(m, np.inf)
+    least, most = _bound("low", low, -none, m), _bound("high", high, none, m)
     states = Demonstrations(
         rows,
-        labels,
+        np.ascontiguousarray(labels, np.float32),
         _episodes(episode_ends, count),
         np.zeros(count, np.int32),
-        labels.copy(),
+        np.array(labels, np.float32),
         np.zeros(count),
         np.zeros(count, bool),
     )
     found = check_dataset(Dataset(states, None, None, least, most, environment))
+    narrowing = Narrowing(rows.shape[1], environment)
+    narrowing.see(wide, rows)
+    narrowing.judge_a_log()
     warn_of_bounds(found)
+    _warn_of_choices(to_numpy(actions))
     return found
+
+
+def _warn_of_choices(actions: np.ndarray) -> None:
+    """Warn of actions that seem to be numbers of choices: as such, 2 is no mean of 1 and 3."""
+    if actions.dtype.kind in "bui" and len(chosen := np.unique(actions)) <= _CHOICES:
+        count = int(chosen[-1]) + 1
+        warn(
+            f"actions of {actions.dtype} are learnt as numbers; if they are choices, from 0 on, "
+            f"write scores: np.eye({count})[chosen] - 1 / {count}"
+        )
 
 
 def _joined(
@@ -102,7 +120,7 @@ def _joined(
 def _numbers(name: str, given: Any) -> np.ndarray:
     found = to_numpy(given)
     if found.dtype.kind in "biuf" and not np.ma.is_masked(given):
-        return np.ascontiguousarray(found, np.float32)
+        return found
     raise SettingError(f"{name} of {found.dtype}", "an array of plain numbers", "convert them")
 
 
@@ -121,7 +139,8 @@ def _episodes(ends: Any, count: int) -> np.ndarray:
     if ends is None:
         return np.zeros(count, np.int32)
     given = np.asarray(ends)
-    said, flags = f"episode_ends={np.array2string(given, threshold=6)}", given.dtype == bool
+    listed = in_one_line(np.array2string(given, threshold=6))
+    said, flags = f"episode_ends={listed}", given.dtype == bool
     if flags and given.shape == (count,):
         given = np.flatnonzero(given) + 1
     good = given.ndim == 1 and given.size > 0 and given.dtype.kind in "iu"

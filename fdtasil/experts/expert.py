@@ -101,6 +101,7 @@ class Expert:
         own_form: Whether it takes observations as an environment has them, in a batch:
             dictionaries, stacks of frames; others take flat rows.
         spaces: Those that it was opened in, where they are no plain boxes; see `structure.py`.
+        opened: The options that it was opened with, in words; None for none.
 
     Example:
         >>> import numpy as np
@@ -128,6 +129,7 @@ class Expert:
     seconds: dict[str, float] = field(default_factory=dict)
     own_form: bool = False
     spaces: Spaces | None = None
+    opened: str | None = None
 
     def ask(self, observations: np.ndarray, purpose: Purpose) -> np.ndarray:
         """Answer a batch and count its rows.

@@ -14,7 +14,7 @@ import torch
 
 from fdtasil.checks import check_choice, check_count, check_flag, check_path, spelt
 from fdtasil.compute import usual_modes
-from fdtasil.errors import ExpertError, FdtasilWarning, SettingError
+from fdtasil.errors import ExpertError, FdtasilWarning, SettingError, in_one_line
 from fdtasil.experts.c_expert import open_c
 from fdtasil.experts.expert import CHUNK, Expert, Hints
 from fdtasil.experts.http_expert import is_http_url, open_http
@@ -195,7 +195,10 @@ def open_expert(source: ExpertLike, hints: Hints) -> Expert:
     if isinstance(source, str | Path):
         check_path("expert", source)
     with usual_modes():
-        return _kind_of(source).opens(source, hints)
+        found = _kind_of(source).opens(source, hints)
+    told = {name: getattr(hints, name) for name in ("output", "inputs", "memory", "trust")}
+    said = [f"{name}={value!r}" for name, value in told.items() if value is not None]
+    return dataclasses.replace(found, opened=in_one_line(", ".join(said))) if said else found
 
 
 def sized(expert: Expert, observation_size: int | None, action_size: int | None) -> Expert:

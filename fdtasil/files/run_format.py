@@ -10,13 +10,24 @@ from fdtasil.errors import StorageError, shown
 from fdtasil.files.lock import was_locked
 from fdtasil.files.names import check_no_links, inside
 from fdtasil.files.reading import from_json, read_plain
-from fdtasil.files.storage import COMING, LOCK, MANIFEST, to_json
+from fdtasil.files.storage import COMING, LOCK, MANIFEST, is_written, to_json
 
-__all__ = ["CHECKPOINTS", "COMMAND", "CONFIG", "check_free", "stamped", "unfinished", "unstamped"]
+__all__ = [
+    "CARD",
+    "CHECKPOINTS",
+    "COMMAND",
+    "CONFIG",
+    "check_finished",
+    "check_free",
+    "stamped",
+    "unstamped",
+]
 
 FORMAT = 1
 """Number of the files' layout: one more whenever older files can't be read any longer."""
 CONFIG, CHECKPOINTS, COMMAND = "config.json", "checkpoints", "command.json"
+CARD = "README.md"
+"""What people complete by hand: a licence, whom to ask."""
 _STAMP = {"format": FORMAT, "made_by": "fdtasil"}
 _OURS_LIMIT = 2**24
 _UNFINISHED_FILE = re.compile(r"\.[\w.]+\.\d+\.[0-9a-f]{8}\.tmp", re.ASCII)
@@ -62,9 +73,15 @@ def _another_format(number: object, values: Mapping[str, Any], source: object) -
     )
 
 
-def unfinished(folder: Path) -> StorageError:
-    """Return what is said where a finished run was expected."""
-    return StorageError(
+def check_finished(folder: Path) -> None:
+    """Refuse the folder of a run that has not ended.
+
+    Raises:
+        StorageError: If it is one.
+    """
+    if is_written(folder) or not (folder / CHECKPOINTS).is_dir():
+        return
+    raise StorageError(
         f"{folder} holds a run that has not ended",
         "a finished run",
         f'go on with it: resume="{folder}" and else the same (fdtasil distill --resume {folder})',

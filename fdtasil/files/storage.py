@@ -137,7 +137,9 @@ def _written_by_us(folder: Path) -> set[str]:
         return set()
 
 
-def verify(folder: Path, names: Collection[str] | None = None) -> dict[str, bytes]:
+def verify(
+    folder: Path, names: Collection[str] | None = None, *, edited: Collection[str] = ()
+) -> dict[str, bytes]:
     """Read the files of a folder that `write_folder` made, checking each against the manifest.
 
     A reader that meets another process in the middle of a move reads again.
@@ -145,6 +147,7 @@ def verify(folder: Path, names: Collection[str] | None = None) -> dict[str, byte
     Args:
         folder: Where.
         names: Which files; None for all of them.
+        edited: Which of them somebody may have changed since.
 
     Returns:
         Content by name.
@@ -155,13 +158,13 @@ def verify(folder: Path, names: Collection[str] | None = None) -> dict[str, byte
     for pause in _PAUSES:
         before = _moment(folder)
         try:
-            return _verified(folder, names)
+            return _verified(folder, names, edited)
         except StorageError:
             # Whoever moves files has the lock; a move that was cut short is not waited for.
             if before == _moment(folder) and not os.path.lexists(folder / LOCK):
                 raise
         time.sleep(pause)
-    return _verified(folder, names)
+    return _verified(folder, names, edited)
 
 
 def _moment(folder: Path) -> tuple[object, object]:
@@ -176,7 +179,9 @@ def _moment(folder: Path) -> tuple[object, object]:
     return found[0], found[1]
 
 
-def _verified(folder: Path, names: Collection[str] | None) -> dict[str, bytes]:
+def _verified(
+    folder: Path, names: Collection[str] | None, edited: Collection[str] = ()
+) -> dict[str, bytes]:
     manifest = _manifest(folder)
     wanted = manifest if names is None else names
     if missing := set(wanted) - manifest.keys():
@@ -190,7 +195,8 @@ def _verified(folder: Path, names: Collection[str] | None) -> dict[str, bytes]:
         raise
     except OSError as error:
         raise _unreadable(folder, error) from error
-    changed = [name for name, data in files.items() if sha256(data) != manifest[name]]
+    checked = files.keys() - edited
+    changed = [name for name in files if name in checked and sha256(files[name]) != manifest[name]]
     if changed:
         raise StorageError(
             f"{folder}: {', '.join(changed)} changed after writing",

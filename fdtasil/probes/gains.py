@@ -121,6 +121,13 @@ def gains(
     # One with a memory is asked about observations with the memory behind them.
     known = isinstance(expert, Expert) and expert.memory is not None
     asked = load_expert(expert) if known else load_expert(expert, rows.shape[1])
+    wanted = asked.observation_size
+    if known and wanted is not None and rows.shape[1] != wanted:
+        raise SettingError(
+            f"states of {rows.shape[1]} numbers for {asked.name}, which has a memory",
+            f"{wanted}: an observation, and what is remembered behind it",
+            "take those of a run: result.demonstrations.observations",
+        )
     random = np.random.default_rng(check_count("seed", seed, 0))
     noise, curvature, nearest = _law(asked, rows, units, random)
     radius = _best_radius(noise, curvature, nearest)

@@ -97,6 +97,23 @@ class Spread:
         plain = {str(i): d for i, d in self.deviations.items()}
         return ({"bounds": plain} if self.where_still else plain) or None
 
+    @classmethod
+    def from_json(cls, written: Any, n: int) -> "Spread":
+        """Read what `to_json` returned, of observations of length n.
+
+        Raises:
+            ValueError: If it is something else.
+        """
+        where_still = isinstance(written, dict) and "bounds" in written
+        plain = written["bounds"] if where_still else written
+        if not isinstance(plain, dict | None):
+            raise ValueError(f"the deviations {written!r}")
+        try:
+            read = dict(_checked(int(i), d, n) for i, d in (plain or {}).items())
+        except SettingError as error:
+            raise ValueError(error.found) from None
+        return cls(read, where_still)
+
 
 def _checked(coordinate: object, deviation: object, n: int) -> tuple[int, float]:
     try:

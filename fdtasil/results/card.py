@@ -33,23 +33,43 @@ def card_of(result: Any) -> str:
         [
             _HEAD,
             f"# A student for {_cell(report['env'])}\n",
-            "A small policy that was distilled from an expert by "
-            "[fdtasil](https://arxiv.org/abs/2205.14812): it matches the expert's actions at the "
-            "states of demonstrations, and around them.\n",
+            "A small policy that fdtasil distilled from an expert: it matches the expert's "
+            f"actions at the states of demonstrations{_around(report['probes'])}.\n",
             "## How good\n",
             f"{judged}\n",
             "## How it came to be\n",
             _table(run_rows(report)) + "\n",
             "## Limits\n",
-            "It was judged in this environment, from its own starts. Elsewhere nobody has looked.",
+            "Nobody has judged it."
+            if evaluation is None
+            else "It was judged in this environment, from its own starts. Elsewhere nobody has "
+            "looked.",
             "\n".join(warnings) + "\n",
             "## Files\n",
-            "`student.onnx` (input `obs`, normaliser and bounds inside), `student.safetensors`, "
-            "`report.json`, `figures/`. A whole run also has `demonstrations.npz`, `config.json` "
-            "and `progress.csv`.\n",
+            f"- `student.onnx`: {_takes(result)} Normaliser and bounds are inside.\n"
+            "- `student.safetensors`, `report.json`, `figures/`\n"
+            "- of a whole run also `demonstrations.npz`, `config.json` and `progress.csv`\n",
             "## Again\n",
             f"```python\n{call_of(result.settings, result.steps_seen)}```\n",
         ]
+    )
+
+
+def _around(probes: str) -> str:
+    if probes == "none":
+        return ", which is plain behaviour cloning"
+    return ", and its reactions around them ([TaSIL](https://arxiv.org/abs/2205.14812))"
+
+
+def _takes(result: Any) -> str:
+    """Return what goes in and out of the student's ONNX file."""
+    student, order = result.student, result.observation_order
+    chooses = student.spaces is not None and student.spaces.actions.choices
+    scores = "`scores`, and the best of them as `actions`" if chooses else "`actions`"
+    what = f" ({_cell(order)})" if order else ""
+    return (
+        f"`obs`, (rows, {student.observation_size}) float32{what}, to {scores}, "
+        f"(rows, {student.action_size})."
     )
 
 

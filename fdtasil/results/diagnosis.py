@@ -124,7 +124,7 @@ def _percent(share: float) -> str:
 def _of_stability(loop: Stability) -> list[str]:
     lines = ["the expert's closed loop, disturbance -> largest deviation"]
     for size, deviation, ended in zip(loop.sizes, loop.deviations, loop.ended, strict=True):
-        early = f"   ({ended} episodes ended early)" if ended else ""
+        early = f"   ({ended} ended early, of two from each start)" if ended else ""
         lines.append(f"  {size:<8.2g} {deviation:10.2g}{early}")
     law = "no power law: rounding, as large as the states vary, or another shape"
     lines.append(f"  {loop.law or law}")

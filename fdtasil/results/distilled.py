@@ -13,24 +13,16 @@ import numpy as np
 from fdtasil.checks import check_path
 from fdtasil.demonstrations.dataset import Dataset, check_shapes
 from fdtasil.demonstrations.states import Demonstrations
-from fdtasil.errors import first_line, warn
+from fdtasil.errors import ExportError, first_line, warn
 from fdtasil.experts.expert import rows_text
 from fdtasil.experts.onnx_expert import COLUMNS, FUNCTION, HISTORY
 from fdtasil.files.border import reads
 from fdtasil.files.lock import locked
 from fdtasil.files.plain import as_kind, without_infinities
 from fdtasil.files.reading import from_json
-from fdtasil.files.run_format import (
-    CHECKPOINTS,
-    CONFIG,
-    check_free,
-    stamped,
-    unfinished,
-    unstamped,
-)
+from fdtasil.files.run_format import CARD, CONFIG, check_finished, check_free, stamped, unstamped
 from fdtasil.files.storage import (
     add_to_folder,
-    is_written,
     to_json,
     verify,
     write_bytes,
@@ -42,7 +34,7 @@ from fdtasil.results.card import card_of
 from fdtasil.results.evaluation import Evaluation, missing_text
 from fdtasil.results.figures import FIGURES
 from fdtasil.results.page import result_html
-from fdtasil.student.exports import SPACES, export
+from fdtasil.student.exports import SPACES, export, order_of
 from fdtasil.student.into_sb3 import agent_of
 from fdtasil.student.policy import Student
 from fdtasil.student.view import StudentObservation, Unseen, View
@@ -112,6 +104,11 @@ class Distilled:
         return past // max(1, own + self.student.action_size) + 1 if past > 0 else 1
 
     @property
+    def observation_order(self) -> str:
+        """What stands where in what the student sees, "" where it is a plain vector."""
+        return order_of(self.student, self._metadata())
+
+    @property
     def demonstrations(self) -> Demonstrations:
         """The labelled states."""
         return self.dataset.demonstrations
@@ -163,13 +160,20 @@ class Distilled:
             SettingError: If there is no such algorithm.
             ExportError: If the student is no actor of it.
         """
+        whole = self.view.is_whole or self.view.columns == (*range(self.dataset.own_size),)
+        if self.steps_seen > 1 or not whole:
+            raise ExportError(
+                "a student that sees another thing than the observation as an agent",
+                "one that sees it whole, as the agent will",
+                "go on with the student's own weights",
+            )
         return agent_of(self.student, env, algorithm, seed)
 
     def export_bytes(self, name: str | Path, inputs: str = "flat") -> bytes:
         """Return what `export` writes to a file of that name."""
         states = self.demonstrations.observations
         chosen = np.linspace(0, len(states) - 1, min(len(states), _PARITY_STATES)).astype(int)
-        seen = self.view.look(states[chosen])
+        seen = np.asarray(self.view.look(states[chosen]), np.float32)
         return export(self.student, seen, self._metadata(), name, inputs)
 
     def save(self, folder: str | Path) -> Path:
@@ -218,9 +222,8 @@ class Distilled:
 
     @classmethod
     def _read(cls, folder: Path, student_obs: StudentObservation | None) -> "Distilled":
-        if not is_written(folder) and (folder / CHECKPOINTS).is_dir():
-            raise unfinished(folder)
-        files = verify(folder)
+        check_finished(folder)
+        files = verify(folder, edited=(CARD,))
         settings = unstamped(files[CONFIG], folder / CONFIG, older=True)
         for name in _COUNTS & settings.keys():
             as_kind(int, settings[name], name)
@@ -283,7 +286,7 @@ def write_run(result: Distilled, folder: Path) -> None:
         "demonstrations.npz": result.dataset.to_bytes(),
         "student.safetensors": result.export_bytes("student.safetensors"),
         **_attempted({"student.onnx": lambda: result.export_bytes("student.onnx")}, notes),
-        "README.md": card_of(result).encode(),
+        CARD: card_of(result).encode(),
         "report.json": _with_notes(report, notes),
     }
     write_folder(folder, core)

@@ -140,12 +140,13 @@ def draw_calibration(found: Calibration) -> bytes:
 
 def _cumulative_steps(history: Sequence[dict[str, float]]) -> list[float]:
     """Return the steps counted on over the rounds, each of which counts from zero."""
-    steps, base, last = [], 0.0, 0.0
+    steps, base = [], 0.0
+    before: Mapping[str, float] = {}
     for entry in history:
-        if entry["step"] <= last:
-            base += last
-        last = entry["step"]
-        steps.append(base + last)
+        if entry["round"] != before.get("round", entry["round"]):
+            base += before["step"]
+        steps.append(base + entry["step"])
+        before = entry
     return steps
 
 

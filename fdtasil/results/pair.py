@@ -1,5 +1,7 @@
 """Paired evaluation: student and expert from the same starts, with an interval."""
 
+from dataclasses import replace
+
 import numpy as np
 
 from fdtasil.errors import warn
@@ -73,7 +75,7 @@ def evaluate_pair(
         survival=_survival(student_episodes),
         expert_survival=_survival(expert_episodes),
         action_error=error,
-        imitation_gap=_imitation_gap(student_episodes, expert_episodes),
+        imitation_gap=_imitation_gap(student_episodes, expert_episodes, own),
         expert_returns=tuple(theirs.tolist()),
         student_returns=tuple(ours.tolist()),
         expert_physics_resets=int((expert_episodes.physics_resets > 0).sum()),
@@ -166,6 +168,10 @@ def _interval(ours: np.ndarray, theirs: np.ndarray, seed: int) -> tuple[float, f
     return (float(low), float(high)) if np.isfinite([low, high]).all() else None
 
 
-def _imitation_gap(student: Episodes, expert: Episodes) -> float:
-    scales = measure_scales(expert.observations[expert.valid])
-    return float(distances(expert, student, scales).mean())
+def _imitation_gap(student: Episodes, expert: Episodes, own: int | None) -> float:
+    """Return how far the paths are apart, in the environment's own observations."""
+    theirs, ours = (
+        replace(path, observations=path.observations[..., :own]) for path in (expert, student)
+    )
+    scales = measure_scales(theirs.observations[theirs.valid])
+    return float(distances(theirs, ours, scales).mean())

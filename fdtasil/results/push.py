@@ -4,22 +4,30 @@ huggingface_hub is imported inside the functions: it is an extra, and `import fd
 """
 
 import re
-from collections.abc import Mapping
+from collections.abc import Collection, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
 from fdtasil.errors import ExportError, SettingError, first_line
 from fdtasil.experts.hub.requests import endpoint, patience
 from fdtasil.files.reading import FILE_LIMIT, read_plain
+from fdtasil.files.run_format import CARD, check_finished
 from fdtasil.files.storage import MANIFEST, verify
 
 if TYPE_CHECKING:
     from huggingface_hub import HfApi
 
-__all__ = ["open_hub", "parcel_of", "send"]
+__all__ = ["left_over", "look_up", "open_hub", "parcel_of", "send"]
 
 _NAME = re.compile(r"[\w.-]+/[\w.-]+", re.ASCII)
-_SENT = ("README.md", "report.json", "student.", "figures/")
+_SENT = (CARD, "report.json", "student.", "figures/")
+_ALWAYS = {"report.json", "student.safetensors"}  # in every repository that a run was sent to
+_RUN = re.compile(
+    r"README\.md|(report|config|manifest)\.json|student\.(onnx|safetensors)|figures/\w+\.png|"
+    r"demonstrations\.npz|progress\.csv",
+    re.ASCII,
+)
 _TIMES_OF_A_REQUEST = 2  # that the patience is long: a request's own limit is the last resort
 
 
@@ -34,7 +42,8 @@ def parcel_of(folder: Path, *, demonstrations: bool = False) -> dict[str, bytes]
     Raises:
         StorageError: If it is no whole run folder.
     """
-    files = verify(folder)
+    check_finished(folder)
+    files = verify(folder, edited=(CARD,))
     if demonstrations:
         return {**files, MANIFEST: read_plain(folder / MANIFEST, FILE_LIMIT, follow=False)}
     return {name: data for name, data in files.items() if name.startswith(_SENT)}
@@ -52,6 +61,7 @@ def open_hub(repository: str) -> "HfApi":
     """
     if not _NAME.fullmatch(repository):
         raise _no_name(repository)
+    patience()  # huggingface_hub itself can't be imported where it is no number
     try:
         from huggingface_hub import HfApi, get_token
         from huggingface_hub.errors import HFValidationError
@@ -76,44 +86,91 @@ def open_hub(repository: str) -> "HfApi":
     return HfApi(endpoint(), token=token)
 
 
-def send(hub: "HfApi", repository: str, files: Mapping[str, bytes], *, public: bool) -> str:
+def look_up(hub: "HfApi", repository: str, *, public: bool) -> set[str] | None:
+    """Return the names of the files of a repository, or None where there is none.
+
+    Args:
+        hub: From `open_hub`.
+        repository: org/name.
+        public: Whether everybody may read what will be sent.
+
+    Raises:
+        SettingError: If it is there, and is not what `public` says.
+        ExportError: If the hub does not answer.
+    """
+    from huggingface_hub import errors
+
+    with _refusals(repository):
+        try:
+            info = hub.model_info(repository, timeout=_TIMES_OF_A_REQUEST * patience())
+        except errors.RepositoryNotFoundError:
+            return None
+    if bool(info.private) == public:
+        raise SettingError(
+            f"{repository} is there already, and "
+            f"{'private' if info.private else 'everybody may read it'}",
+            f"a {'public' if public else 'private'} repository",
+            f"{'leave --public out' if public else 'add --public'}, or name another one",
+        )
+    return {sibling.rfilename for sibling in info.siblings or []}
+
+
+def left_over(there: Collection[str] | None, files: Collection[str]) -> list[str]:
+    """Return which files of an earlier run in a repository the new one does not replace.
+
+    They are none of the new run's: demonstrations of another expert beside its student, say. What
+    is not a run's is left alone, and so is all in a repository that no run was sent to.
+    """
+    if there is None or not set(there) >= _ALWAYS:
+        return []
+    return sorted(name for name in there if _RUN.fullmatch(name) and name not in files)
+
+
+def send(
+    hub: "HfApi",
+    repository: str,
+    files: Mapping[str, bytes],
+    there: Collection[str] | None,
+    *,
+    public: bool,
+) -> str:
     """Send files to a repository, which is made if there is none, in one commit.
 
     Args:
         hub: From `open_hub`.
         repository: org/name.
         files: Content by name.
+        there: From `look_up`.
         public: Whether everybody may read them.
 
     Returns:
         The address of the repository.
 
     Raises:
-        SettingError: If the repository is public, and `public` does not say so.
         ExportError: If the hub does not take them.
     """
-    from huggingface_hub import CommitOperationAdd, errors
+    from huggingface_hub import CommitOperationAdd, CommitOperationDelete
 
-    try:
-        try:
-            wait = _TIMES_OF_A_REQUEST * patience()
-            private = hub.model_info(repository, timeout=wait).private
-        except errors.RepositoryNotFoundError:
+    with _refusals(repository):
+        if there is None:
             hub.create_repo(repository, private=not public)
-            private = not public
-        if not private and not public:
-            raise SettingError(
-                f"{repository} is there already, and everybody may read it",
-                "a private repository",
-                "add --public, or name another one",
-            )
-        operations = [CommitOperationAdd(name, data) for name, data in files.items()]
+        operations = [
+            *(CommitOperationAdd(name, data) for name, data in files.items()),
+            *(CommitOperationDelete(name, is_folder=False) for name in left_over(there, files)),
+        ]
         hub.create_commit(repository, operations, commit_message="A student by fdtasil")
+    return f"{endpoint()}/{repository}"
+
+
+@contextmanager
+def _refusals(repository: str) -> Iterator[None]:
+    """Tell what the hub says, whatever it is, of a repository."""
+    try:
+        yield
     except SettingError:
         raise
     except Exception as error:  # of the network, of the hub, of what it says about the card
         raise _refused(error, repository) from error
-    return f"{endpoint()}/{repository}"
 
 
 def _no_name(repository: str) -> SettingError:

@@ -18,12 +18,11 @@ class Smoothness(NamedTuple):
 
     Attributes:
         roughness: Mean change of an action from one step to the next: of bounded actions in units
-            of half their range, of others of the expert's deviation, of choices the share that
-            change.
-            None where no episode has two steps.
+            of half their range, of others of the expert's deviation, of a choice 1 where it
+            changes. None where no episode has two steps.
         high_frequency: Share of the power of the actions' changes about their mean that is faster
-            than half of the fastest that the time step allows (a period of four steps); None for
-            choices, for constant actions, and for episodes of fewer than 16 steps.
+            than half of the fastest that the time step allows (a period of four steps); None where
+            all actions are choices or constant, and for episodes of fewer than 16 steps.
     """
 
     roughness: float | None
@@ -44,14 +43,18 @@ def smoothness_of(episodes: Episodes, pool: EnvironmentPool, expert: Episodes) -
     both = episodes.valid[:, 1:] & episodes.valid[:, :-1]
     if not both.any():
         return Smoothness(None, None)
-    if chosen.choices:
-        best = chosen.best(acted.reshape(-1, m)).reshape(*episodes.valid.shape, -1)
-        return Smoothness(float((best[:, 1:] != best[:, :-1])[both].mean()), None)
+    scores = [column for start, end in chosen.choices for column in range(start, end)]
+    numbers = np.setdiff1d(np.arange(m), scores)
     taken, _ = pool.bounds.put_inside(expert.actions[expert.valid])
     units = action_units(pool.boxes.low, pool.boxes.high, taken)
-    scaled = acted / units
-    rough = float(np.abs(np.diff(scaled, axis=1))[both].mean())
-    return Smoothness(rough, _high_frequency(scaled, episodes.lengths))
+    scaled = (acted / units)[:, :, numbers]
+    changes = np.abs(np.diff(scaled, axis=1))[both]
+    if chosen.choices:
+        best = chosen.best(acted.reshape(-1, m)).reshape(*episodes.valid.shape, -1)
+        other = (best[:, 1:] != best[:, :-1])[both]
+        changes = np.concatenate([changes, other], axis=1)
+    fast = _high_frequency(scaled, episodes.lengths) if len(numbers) else None
+    return Smoothness(float(changes.mean()), fast)
 
 
 def _high_frequency(actions: np.ndarray, lengths: np.ndarray) -> float | None:

@@ -84,7 +84,9 @@ def call_of(settings: Mapping[str, Any], history: int) -> str:
         hidden = tuple(student.get("hidden", ()))
         given.append(f"student=fdtasil.Mlp({hidden}, {student.get('activation')!r})")
     fit = settings["fit"]
-    names = [name for name in fit if name in _FIT and fit[name] is not None]
+    # A length that was left out grows with the states, which are there again.
+    grown = {"steps"} if fit.get("steps_for") is not None else set()
+    names = [name for name in fit if name in _FIT - grown and fit[name] is not None]
     told = ", ".join(f"{name}={fit[name]}" for name in names)
     given.append(f"fit=fdtasil.Fit({told})")
     inside = ",\n".join(f"    {one}" for one in given)
@@ -117,14 +119,22 @@ def _in_no_file(settings: Mapping[str, Any]) -> dict[str, str]:
     """Return the arguments that a reader has to make again, by name, with what they were."""
     expert, env, data = settings["expert"], _environment(settings), settings.get("dataset")
     seen = settings.get("student_obs")
-    is_address = is_http_url(expert) or is_hub_uri(expert)
     found = {
-        "expert": None if settings.get("expert_sha256") or is_address else expert,
+        "expert": _expert_in_words(expert, settings),
         "env": _environment_in_words(env, settings.get("made")),
         "dataset": data and f"sha256 {data}",
         "student_obs": seen if isinstance(seen, str) else None,  # a function
     }
     return {name: said for name, said in found.items() if said is not None}
+
+
+def _expert_in_words(name: str | None, settings: Mapping[str, Any]) -> str | None:
+    """Return what an expert is; None where its file or address alone tells."""
+    if settings.get("opened"):
+        return f"{name}, opened with {settings['opened']}"
+    if settings.get("expert_sha256") or is_http_url(name) or is_hub_uri(name):
+        return None
+    return settings["expert"]
 
 
 def _environment_in_words(name: str | None, made: str | None) -> str | None:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from fdtasil.errors import EnvironmentFault, warn
+from fdtasil.errors import EnvironmentFault, SettingError, warn
 
 __all__ = ["Narrowing"]
 
@@ -35,23 +35,45 @@ class Narrowing:
         Raises:
             EnvironmentFault: If that are all that move.
         """
+        found, whole = self._found()
+        if found is None:
+            return
+        advice = "subtract a constant in gymnasium.wrappers.TransformObservation"
+        if not whole:
+            warn(f"{found}: {advice}")
+            return
+        raise EnvironmentFault(
+            found, "observations whose movement float32 can hold: experts are asked in it", advice
+        )
+
+    def judge_a_log(self) -> None:
+        """Warn of the same coordinates of states that were recorded elsewhere.
+
+        Raises:
+            SettingError: If that are all that move.
+        """
+        found, whole = self._found()
+        if found is None:
+            return
+        advice = "subtract a constant from the column, and where the student runs too"
+        if not whole:
+            warn(f"{found}: {advice}")
+            return
+        raise SettingError(found, "observations whose movement float32 can hold", advice)
+
+    def _found(self) -> tuple[str | None, bool]:
+        """Return what is rounded away, in words, and whether nothing else moves."""
         if not np.isfinite(self._low).all():
-            return  # nothing was narrowed
+            return None, False  # nothing was narrowed
         span = self._high - self._low
         moves = span > _STILL * np.maximum(np.abs(self._low), np.abs(self._high))
         rounded = np.flatnonzero(moves & (self._lost > _LOST * span))
         if not len(rounded):
-            return
+            return None, False
         first = int(rounded[0])
         found = (
             f"{self._name}: float32 rounds away how {len(rounded)} of the {int(moves.sum())} "
             f"observations that move do so; number {first} moves by {span[first]:.2g} beside "
             f"values of {self._high[first]:.2g}"
         )
-        advice = "subtract a constant in gymnasium.wrappers.TransformObservation"
-        if len(rounded) < moves.sum():
-            warn(f"{found}: {advice}")
-            return
-        raise EnvironmentFault(
-            found, "observations whose movement float32 can hold: experts are asked in it", advice
-        )
+        return found, len(rounded) == int(moves.sum())

@@ -11,8 +11,11 @@ import numpy as np
 from fdtasil.errors import EnvironmentFault, FdtasilError, warn
 from fdtasil.rollouts.behaviours import random_behaviour
 from fdtasil.rollouts.environments import EnvironmentPool, simulator_warnings
+from fdtasil.rollouts.flattening import Flat
+from fdtasil.rollouts.history import WithHistory
 from fdtasil.rollouts.playing import InTurn, Playing, SideBySide
 from fdtasil.rollouts.recording import Recording
+from fdtasil.rollouts.remembering import Remembering
 from fdtasil.rollouts.stepping import step_together
 
 __all__ = [
@@ -119,11 +122,16 @@ def check_repeats(pool: EnvironmentPool, seed: int, *, force: bool = False) -> N
     if force:
         warn(f"{found} (forced)")
         return
-    frozen = ", or set its update_running_mean = False" * hasattr(layer, "update_running_mean")
+    mend = "or let its reset() clear all that it keeps"
+    if hasattr(layer, "update_running_mean"):
+        mend = "or set its update_running_mean = False"
+    leave = f"leave {kind} out of the environment, {mend}"
+    if not isinstance(layer, gymnasium.Wrapper):
+        leave = f"let reset() of {kind} clear all that it keeps"
     raise EnvironmentFault(
         found,
         "equal episodes for equal seeds and actions: returns could not be compared",
-        f"leave {kind} out of the environment{frozen}; force=True goes on as it is",
+        f"{leave}; force=True goes on as it is",
     )
 
 
@@ -269,15 +277,25 @@ def _trial(
 
 
 def _culprit(pool: EnvironmentPool, seed: int) -> gymnasium.Env:
-    """Return the innermost layer of an environment that does not repeat itself."""
+    """Return the innermost layer of an environment that does not repeat itself.
+
+    One whose spaces are no flat boxes can't be tried alone: then the outermost of these.
+    """
     (member,) = pool.take(1)
     layers = list(reversed(list(_layers(member))))
     known = [layer for layer in layers if getattr(layer, "update_running_mean", False)]
     for layer in known or layers:
         with suppress(FdtasilError):  # it may have other spaces than the whole
             if _trial(pool, [layer], seed).other_than(_trial(pool, [layer], seed)):
-                return layer
-    return known[0] if known else member
+                return _theirs(layer)
+    return known[0] if known else _theirs(member)
+
+
+def _theirs(layer: gymnasium.Env) -> gymnasium.Env:
+    """Return the outermost layer that is not one of this library's."""
+    while isinstance(layer, Flat | WithHistory | Remembering):
+        layer = layer.env
+    return layer
 
 
 def _remembers(pool: EnvironmentPool, layer: gymnasium.Env, first: Trial, seed: int) -> bool:

@@ -128,18 +128,23 @@ class Account:
         with self._asked.repeating(), self._silent.repeating():
             yield
 
-    def check_budget(self, rows: int, most: int | None) -> None:
+    def check_budget(self, rows: int, most: int | None, later: int = 0) -> None:
         """Refuse to ask beyond the budget: early ends make a resampling source ask more often.
 
         What a resumed run had to ask again is no part of what the run needs.
 
+        Args:
+            rows: That are due now.
+            most: That may be asked in all.
+            later: That the end of the run will ask: its evaluation.
+
         Raises:
-            SettingError: If `rows` more are more than `most` in all.
+            SettingError: If they are more.
         """
         asked = self.queries.total()
-        if most is not None and asked + rows > most:
+        if most is not None and asked + rows + later > most:
             raise SettingError(
-                f"{asked:,} queries are asked, and {rows:,} more are due",
+                f"{asked:,} queries are asked, and {rows + later:,} more are due",
                 f"at most max_queries={most:,}",
                 "raise max_queries, or write probes=10, which are asked once",
             )

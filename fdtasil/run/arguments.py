@@ -177,9 +177,12 @@ class Arguments:
             reason=None,
             spaces=subject.spaces,
             made=subject.pool.made if subject.pool else None,
+            opened=expert.opened if expert else None,
         )
 
     def _spread(self, subject: Subject) -> Spread:
+        if self.spread is None and self.given is not None:
+            return self.given.spread
         boxes = subject.pool.boxes if subject.pool else None
         low, high = (boxes.observation_low, boxes.observation_high) if boxes else (None, None)
         layout = subject.spaces.observations if subject.spaces else None
@@ -212,7 +215,14 @@ def read_arguments(
     """
     defaults = preset_of(preset)
     fit, curved = defaults.fit if fit is None else _checked_fit(fit), callable(student_obs)
-    given = _without_other_answers(given, probes, defaults, fit.order) if can_ask else given
+    if can_ask:
+        given = _without_other_answers(given, probes, defaults, fit.order)
+    elif probes is None and given is not None and given.answers is None:
+        raise SettingError(
+            "a dataset without answers to probes, and no expert",
+            "an expert to ask, or probes=0 for plain behaviour cloning",
+            "pass one of the two",
+        )
     return Arguments(
         given=given,
         preset=defaults,

@@ -99,7 +99,7 @@ class Asking:
         compares = self._run.own_derivatives and stream == (0, 0) and not known
         if self._run.own_derivatives:
             due = new + (comparison_rows(around.observations.shape[1]) if compares else 0)
-        self._account.check_budget(due, self._run.max_queries)
+        self._account.check_budget(due, self._run.max_queries, self._run.asked_at_the_end)
         if compares:
             check_derivatives(self._askable(), around.observations)
         return self._ask(around, stream, beginning, twin)

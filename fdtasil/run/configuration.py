@@ -60,6 +60,7 @@ class Configuration:
         own_derivatives: Whether the expert gives the derivatives that are matched.
         spaces: Of the environment, where they are no plain boxes.
         made: How the environment is made and reset, in words, where its id does not say it.
+        opened: With which options the expert was opened, in words; None for none.
     """
 
     expert: str | None
@@ -92,6 +93,7 @@ class Configuration:
     own_derivatives: bool = False
     spaces: Spaces | None = None
     made: str | None = None
+    opened: str | None = None
 
     @property
     def held(self) -> tuple[int, ...]:
@@ -121,8 +123,8 @@ class Configuration:
             found["calibrate"] = self.ladder.queries if self.calibrated else 0
         if self.expert is not None and self.horizon:
             gates = 2 if self.evaluation_episodes else 1
-            again = GATE_STATES if self.evaluation_episodes or self.trainer is not None else 0
-            found["check"] = gates * GATE_QUERIES + self._largest_batch(found) + again
+            found["check"] = gates * GATE_QUERIES + self._largest_batch(found)
+            found["check"] += self._asked_again
             found["check"] += GATE_STATES if self.dataset is not None else 0
             found["evaluate"] = 2 * self.evaluation_episodes * self.horizon
         elif self.expert is not None:  # on the states of a dataset
@@ -170,6 +172,17 @@ class Configuration:
         return large_batch(rows, self.batch)
 
     @property
+    def asked_at_the_end(self) -> int:
+        """Rows that the evaluation asks at most, and the look that follows it."""
+        if self.expert is None or not self.horizon:
+            return 0
+        return self.evaluation_episodes * self.horizon + self._asked_again
+
+    @property
+    def _asked_again(self) -> int:
+        return GATE_STATES if self.evaluation_episodes or self.trainer is not None else 0
+
+    @property
     def order(self) -> int:
         """0, 1 or 2, the order of the Taylor loss."""
         return self.fit.order if self.probes else 0
@@ -197,12 +210,17 @@ class Configuration:
         seen = columns if isinstance(columns, tuple) else range(self.observation_size)
         return set(seen) - set(self.held)
 
-    def check_spread(self) -> None:
+    def check_spread(self, stored: Spread | None) -> None:
         """Refuse deviations that no probe is moved by; plain cloning normalises by them.
+
+        Args:
+            stored: Those that stored answers were asked with.
 
         Raises:
             SettingError: If there are some.
         """
+        if self.spread == stored:
+            return
         lost = sorted({*self.spread.deviations} - self.moved)
         if lost and not self.spread.where_still:
             raise SettingError(
@@ -228,10 +246,11 @@ class Configuration:
         total = sum(predicted.values())
         if self.max_queries is None or total <= self.max_queries:
             return
+        lower = "lower episodes, horizon or evaluation_episodes" if self.horizon else "probes=0"
         raise SettingError(
             f"this run may ask the expert {total:,} times ({rows_text(predicted)})",
             f"at most max_queries={self.max_queries:,}",
-            f"{self._fewer()}lower episodes, horizon or evaluation_episodes, or raise max_queries",
+            f"{self._fewer()}{lower}, or raise max_queries",
         )
 
     def _fewer(self) -> str:

@@ -78,8 +78,9 @@ def diagnose(
         env: As in `distill`.
         episodes: From as many starts.
         horizon: Steps after which an episode is cut; default: the environment's time limit.
-        steps: From the start of each episode, how many steps are disturbed and followed. Legged
-            robots are chaotic: after a few dozen the smallest disturbance has led elsewhere.
+        steps: From the start of each episode, how many steps are disturbed and followed, at
+            most `horizon`. Legged robots are chaotic: after a few dozen the smallest disturbance
+            has led elsewhere.
         seed: Of starts and directions.
         force: Go on with a warning where the expert fails the gate but answers.
         progress: Show progress bars, in a terminal or a notebook.

@@ -19,6 +19,7 @@ __all__ = [
     "warn_of_falls",
     "warn_of_idle_weights",
     "warn_of_misfit",
+    "warn_of_rounded_movement",
     "warn_of_silence",
     "warn_of_small_units",
     "warn_of_still_coordinates",
@@ -28,6 +29,7 @@ _FEW = 5  # demonstrations, of which each counts
 _USUALLY = 0.75  # share of the expert's episodes that it survives
 _MISFIT = 0.15  # share of the actions' deviation; students of the experts here reach 0.01
 _SHOWN = 8  # coordinates named in a warning
+_CLEARLY = 4  # of float32's steps, that rounding does not move a coordinate by
 _SMALL = 1e-4  # of the median deviation; robots' observations differ by less
 
 
@@ -132,6 +134,24 @@ def warn_of_small_units(scales: Scales) -> None:
             f"({told}{more}): that is taken for their units; of one that only stands nearly still "
             "here, spread={coordinate: deviation} says how far it will go"
         )
+
+
+def warn_of_rounded_movement(lesson: Lesson) -> None:
+    """Warn of coordinates that move by few of the steps that float32 has beside their offset.
+
+    They count as still, are neither normalised nor probed, and are no constants.
+    """
+    sizes = np.abs(lesson.dataset.demonstrations.observations).max(axis=0)
+    still, deviations = lesson.scales.seen & ~lesson.scales.live, lesson.scales.deviation
+    found = np.flatnonzero(still & (deviations > _CLEARLY * np.spacing(sizes)))
+    if not len(found):
+        return
+    told, more = _listed(found, deviations)
+    warn(
+        f"{len(found)} coordinates move by few of the steps that float32 has beside their offset "
+        f"({told}{more}; number {found[0]} beside {sizes[found[0]]:.6g}), and count as still, "
+        "which is neither normalised nor probed: subtract a constant"
+    )
 
 
 def _listed(found: np.ndarray, deviations: np.ndarray) -> tuple[str, str]:

@@ -155,6 +155,8 @@ class _Player:
         self._seen, reward, terminated, truncated, _ = self._env.step(action)
         self.total, self.step = self.total + float(reward), self.step + 1
         self.over = bool(terminated or truncated)
+        if self.over:  # where it ended is shown, whatever pictures are left out
+            self.picture = self._drawn()
 
     def draw(self) -> np.ndarray:
         """Return the picture of now."""
@@ -293,13 +295,30 @@ def _mp4(pictures: Iterator[np.ndarray], fps: float) -> bytes:
         return file.read_bytes()
 
 
-def _still(kind: str, **options: Any) -> Callable[[Iterator[np.ndarray], float], bytes]:
-    """Return what writes a format of pictures that move."""
+def _still(
+    kind: str, grain: int, least: int, **options: Any
+) -> Callable[[Iterator[np.ndarray], float], bytes]:
+    """Return what writes a format of pictures that move.
+
+    Args:
+        kind: What Pillow calls it.
+        grain: Milliseconds that it counts in.
+        least: Milliseconds that viewers show a picture for at least.
+        **options: Of Pillow.
+    """
 
     def write(pictures: Iterator[np.ndarray], fps: float) -> bytes:
-        first, *rest = (Image.fromarray(picture) for picture in pictures)
-        step = round(1000 / fps)
-        durations = [step] * len(rest) + [round(1000 * _LAST)]
+        kept, times = [], []
+        last = None
+        for number, last in enumerate(pictures):
+            time = grain * round(1000 * number / fps / grain)
+            if not times or time - times[-1] >= least:
+                kept.append(Image.fromarray(last))
+                times.append(time)
+        if last is not None:  # how it ends is seen, whatever is left out
+            kept[-1] = Image.fromarray(last)
+        first, *rest = kept
+        durations = [*np.diff(times).tolist(), round(1000 * _LAST)]
         target = BytesIO()
         about = {"save_all": True, "append_images": rest, "duration": durations, "loop": 0}
         first.save(target, kind, **about, **options)
@@ -310,7 +329,7 @@ def _still(kind: str, **options: Any) -> Callable[[Iterator[np.ndarray], float],
 
 _WRITERS: dict[str, Callable[[Iterator[np.ndarray], float], bytes]] = {
     ".mp4": _mp4,
-    ".webp": _still("WEBP", quality=60, method=4),
-    ".gif": _still("GIF", optimize=True),
+    ".webp": _still("WEBP", 1, 1, quality=60, method=4),
+    ".gif": _still("GIF", 10, 20, optimize=True),  # many take a shorter time for 100
 }
 """Every format by the suffix of its file."""

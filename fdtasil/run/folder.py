@@ -31,7 +31,8 @@ CHECKPOINT_SECONDS = 20.0
 
 _CONFIG_LIMIT = 2**24
 _FINGERPRINT = "fingerprint"
-_MADE = "made"  # in words: the fingerprint tells whether it is the same
+# In words: a fingerprint, and the expert's own answers, tell whether they are the same.
+_MADE, _OPENED = "made", "opened"
 _FREE = "max_queries"  # what a run is allowed to ask changes none of its bytes
 _REASON = "reason"  # follows from what may be another
 
@@ -117,9 +118,8 @@ class RunFolder:
     @property
     def finished(self) -> bool:
         """Whether the folder holds a finished run."""
-        if self._path is None or (self._path / CHECKPOINTS).exists():
-            return False
-        return is_written(self._path)
+        # What could not be dropped of its checkpoints may be left.
+        return self._path is not None and not self.begun and is_written(self._path)
 
     def save(
         self, round_: int, stage: str, number: int, files: Callable[[], dict[str, bytes]]
@@ -208,7 +208,7 @@ def _read_config(path: Path) -> dict[str, Any]:
 def _check_same(
     before: dict[str, Any], now: dict[str, Any], path: Path, *, finished: bool
 ) -> None:
-    left_out = {_FREE: None, _REASON: None, _FINGERPRINT: None, _MADE: None}
+    left_out: dict[str, None] = dict.fromkeys((_FREE, _REASON, _FINGERPRINT, _MADE, _OPENED))
     if before.get("expert_sha256") is not None and before["expert_sha256"] == now["expert_sha256"]:
         left_out["expert"] = None  # the same file, wherever it lies now
     changed = _differences({**before, **left_out}, {**now, **left_out})

@@ -92,7 +92,8 @@ def distill(
             Face hub (`hf://org/repo/file[@revision]`), a torch module, an object with
             stable-baselines3's `predict`, a function on batches (B, n) -> (B, m) in environment
             units, an address, or what `load_expert` made of one of them with options of its own.
-            None with `dataset`: then nobody is asked, and `probes` are those that it holds, or 0.
+            None with `dataset`: then nobody is asked, and `probes` are those that it holds; of one
+            without answers, write 0.
         env: A gymnasium id (`module:Id` too), a gymnasium environment, a vector environment
             (gymnasium's or stable-baselines3's), a function making one, or a
             `fdtasil.Environment`, which says what it is made and reset with. None with `dataset`:
@@ -184,6 +185,13 @@ def distill(
     check_history(history, student_obs)
     if env is None:
         _check_nothing_to_step(horizon=horizon, constraints=constraints)
+    if limits is not None and (expert is None or evaluation_episodes == 0):
+        raise SettingError(
+            f"constraints= {'without an expert' if expert is None else 'and no evaluation'}",
+            "an evaluation, which counts where they are violated",
+            f"{'pass expert=' if expert is None else 'raise evaluation_episodes='}, or leave "
+            "constraints= out",
+        )
     arguments = read_arguments(
         given,
         probes,
@@ -215,7 +223,7 @@ def distill(
             given = showing(given, history, subject.actions)
         arguments = replace(arguments, given=given, student_obs=student_obs)
         run, bars = arguments.configure(subject, going_on), Progress(progress)
-        run.check_spread()
+        run.check_spread(given.spread if given is not None else None)
         run.check_budget()
         usual = arguments.preset.fit
         warn_of_idle_weights(run.fit, usual, run.probes, calibrated=run.calibrated)
@@ -299,7 +307,8 @@ def _complete(
         seconds, student = checkpoints.account.seconds, trained.student
         evaluation = _evaluated(rounds, subject, theirs, lesson, trained, constraints)
         if run.fit.steps is None and run.fit.epochs is None:  # else the caller chose the length
-            act, steps = lesson.view.policy(student.act), trained.steps
+            # The last round's: the length that a caller says is that of one round.
+            act, steps = lesson.view.policy(student.act), int(trained.history[-1]["step"])
             warn_of_misfit(lesson, act, steps, remembers=subject.remembered > 0)
         _ask_again(run, subject.expert, theirs, lesson)
         if subject.expert is not None:
@@ -325,7 +334,7 @@ def _complete(
         queries=report["queries"],
         settings=config_of(run),
         report=report,
-        dataset=lesson.dataset,
+        dataset=replace(lesson.dataset, spread=run.spread),
         view=lesson.view,
     )
 

@@ -23,7 +23,12 @@ from fdtasil.run.checkpoints import (
 )
 from fdtasil.run.collecting import Collecting
 from fdtasil.run.configuration import Configuration
-from fdtasil.run.doubts import warn_of_falls, warn_of_small_units, warn_of_still_coordinates
+from fdtasil.run.doubts import (
+    warn_of_falls,
+    warn_of_rounded_movement,
+    warn_of_small_units,
+    warn_of_still_coordinates,
+)
 from fdtasil.run.events import Event
 from fdtasil.run.lesson import Lesson
 from fdtasil.run.training import Training
@@ -82,6 +87,7 @@ class Rounds:
         last = round_ == len(self.run.rounds) - 1
         if last:
             warn_of_small_units(lesson.scales)
+            warn_of_rounded_movement(lesson)
         if expert is not None and round_ == 0 and self.collecting is not None:
             warn_of_falls(lesson.dataset.demonstrations, expert, self.run.keep)
         if expert is not None and last and self.run.can_spread:

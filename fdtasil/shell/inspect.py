@@ -86,9 +86,10 @@ def command(
 
 
 def _contract(looked: Looked, pool: EnvironmentPool) -> list[tuple[str, object]]:
-    boxes, expert = pool.boxes, looked.expert
+    expert, size = looked.expert, pool.boxes.observation_size
+    memory = expert.memory.size if expert is not None and expert.memory is not None else 0
     rows: list[tuple[str, object]] = [
-        ("observations", boxes.observation_size),
+        ("observations", f"{size - memory}{f', and {memory} of memory' if memory else ''}"),
         ("actions", _actions(pool)),
     ]
     if expert is not None:

@@ -4,7 +4,7 @@ from typing import Annotated
 
 import tyro
 
-from fdtasil.results.push import open_hub, parcel_of, send
+from fdtasil.results.push import left_over, look_up, open_hub, parcel_of, send
 from fdtasil.shell.command import RunFolder
 
 __all__ = ["command"]
@@ -32,8 +32,11 @@ def command(
     """
     files = parcel_of(run, demonstrations=demonstrations)
     hub = open_hub(repository)
+    there = look_up(hub, repository, public=public)
     print(f"to {repository}, {'which everybody may read' if public else 'private'}:")
     for name, data in sorted(files.items()):
         print(f"  {len(data):12,} bytes  {name}")
+    for name in left_over(there, files):
+        print(f"  {'removed':>18}  {name}, of an earlier run; its history keeps it")
     print("The card and the report name your expert as you did, with its path.", flush=True)
-    print(f"sent: {send(hub, repository, files, public=public)}")
+    print(f"sent: {send(hub, repository, files, there, public=public)}")

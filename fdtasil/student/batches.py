@@ -90,7 +90,8 @@ class _Dealer:
         self._number = number
         self._gains = _floats(answers.gains).to(self._device)
         self._bank = _floats(answers.displacements).to(self._device)
-        self._numbers = torch.from_numpy(np.ascontiguousarray(answers.numbers)).to(self._device)
+        numbers = np.array(answers.numbers)  # a view of one row can't be written, as torch wants
+        self._numbers = torch.from_numpy(numbers).to(self._device)
         self._values = _floats(answers.values).to(self._device)
         self._used = self._probes.used_per_visit(answers.numbers.shape[1])
 

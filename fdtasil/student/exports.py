@@ -20,7 +20,7 @@ from fdtasil.student.plain import PlainPolicy
 from fdtasil.student.policy import Student
 from fdtasil.student.tflite import tflite_model
 
-__all__ = ["EXPORTS", "SPACES", "export"]
+__all__ = ["EXPORTS", "SPACES", "export", "order_of"]
 
 _LONG = 120  # letters of a list that a comment shows whole
 SPACES = "fdtasil.spaces"
@@ -70,7 +70,7 @@ def _plain(student: Student) -> PlainPolicy:
     return found
 
 
-def _order(student: Student, metadata: Mapping[str, str]) -> str:
+def order_of(student: Student, metadata: Mapping[str, str]) -> str:
     """Return what stands where in an observation, "" where it is a plain vector."""
     if HISTORY in metadata:
         steps, m = int(metadata[HISTORY]), student.action_size
@@ -94,7 +94,7 @@ def _order(student: Student, metadata: Mapping[str, str]) -> str:
 
 def _comment(student: Student, metadata: Mapping[str, str]) -> dict[str, str]:
     """Return the lines of a C file's comment: of the spaces, those that a reader needs."""
-    order = _order(student, metadata)
+    order = order_of(student, metadata)
     kept = {name: text for name, text in metadata.items() if name != SPACES}
     return kept | ({"observation": order} if order else {})
 
@@ -120,12 +120,12 @@ def _tflite(student: Student, states: np.ndarray, metadata: Mapping[str, str]) -
 
 
 def _h(student: Student, states: np.ndarray, metadata: Mapping[str, str]) -> bytes:
-    return c_header(_plain(student), _order(student, metadata)).encode()
+    return c_header(_plain(student), order_of(student, metadata)).encode()
 
 
 def _py(student: Student, states: np.ndarray, metadata: Mapping[str, str]) -> bytes:
     _plain(student)  # who is no such network needs torch
-    order = _order(student, metadata)
+    order = order_of(student, metadata)
     first = f"# The observation: {in_one_line(order)}\n" if order else ""
     return f"{first}{inspect.getsource(plain)}".encode()
 

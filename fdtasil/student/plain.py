@@ -17,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 
-__all__ = ["PLAIN", "PlainPolicy", "choices_of", "cut_of"]
+__all__ = ["PLAIN", "PlainPolicy", "choices_of", "cut_of", "middle_of"]
 
 
 def _gelu(x: np.ndarray) -> np.ndarray:
@@ -107,9 +107,8 @@ class PlainPolicy:
         layers = [(tensors[f"{name}.weight"], tensors[f"{name}.bias"]) for name in names]
         low, high = tensors["low"], tensors["high"]
         bounded = np.isfinite(low) & np.isfinite(high)
-        with np.errstate(invalid="ignore"):  # of infinite bounds, whose middles are stored
-            centre = tensors.get("_centre", (high + low) / 2)
-            half = tensors.get("_half", (high - low) / 2)
+        centre, half = middle_of(low, high)  # those of infinite bounds are stored
+        centre, half = tensors.get("_centre", centre), tensors.get("_half", half)
         bend = about["student"].get("activation", "gelu")
         if bend not in PLAIN:
             raise ValueError(f"the activation {bend!r}, where one of {', '.join(PLAIN)} is known")
@@ -171,6 +170,20 @@ def choices_of(parts: Sequence[dict]) -> list[tuple[int, int, int]]:
         if not part["sizes"]:
             start += int(np.prod(part["shape"]))
     return found
+
+
+def middle_of(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return (m,) float32 middle and half of the range of bounds; no numbers where one is none.
+
+    The half is less where middle and half together would be rounded beyond a bound.
+    """
+    low, high = low.astype(np.float64), high.astype(np.float64)
+    with np.errstate(invalid="ignore"):
+        centre = ((high + low) / 2).astype(np.float32)
+        inside = np.minimum(high - centre, centre - low)
+        half = inside.astype(np.float32)
+        half = np.where(half > inside, np.nextafter(half, np.float32(0)), half)
+        return centre, np.where(half > 0, half, ((high - low) / 2).astype(np.float32))
 
 
 def cut_of(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray] | None:

@@ -17,7 +17,7 @@ from fdtasil.files.tensors import tensors_from_bytes, tensors_to_bytes
 from fdtasil.probes.scales import Scales
 from fdtasil.rollouts.spaces import Mismatch, Spaces
 from fdtasil.student.architectures import Architecture, Mlp, architecture_of, describe
-from fdtasil.student.plain import PlainPolicy, choices_of, cut_of
+from fdtasil.student.plain import PlainPolicy, choices_of, cut_of, middle_of
 
 __all__ = ["Student"]
 
@@ -76,9 +76,8 @@ class Student(nn.Module):
         self.network = architecture.build(len(mean), len(low), random)
         bounded = np.isfinite(low) & np.isfinite(high)
         middle, reach = (0.0, 1.0) if actions is None else (actions.mean, actions.scale)
-        with np.errstate(invalid="ignore"):  # of infinite bounds, which are not chosen
-            centre = np.where(bounded, (high + low) / 2, middle)
-            half = np.where(bounded, (high - low) / 2, reach)
+        between = middle_of(low, high)
+        centre, half = np.where(bounded, between[0], middle), np.where(bounded, between[1], reach)
         # Where all are bounded they follow from the bounds, and no file needs them.
         stored = not bounded.all()
         self.register_buffer("_bounded", torch.from_numpy(bounded), persistent=False)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from fdtasil.errors import ExpertError
 from fdtasil.files.onnx.side_files import load_side_files, names_of_side_files
 from fdtasil.files.reading import read_limited
-from fdtasil.files.run_format import CHECKPOINTS, unfinished
+from fdtasil.files.run_format import check_finished
 from fdtasil.files.storage import sha256
 
 if TYPE_CHECKING:
@@ -110,8 +110,7 @@ def side_files(data: bytes) -> set[str]:
 
 def _read_bytes(path: Path) -> bytes:
     if path.is_dir():
-        if (path / CHECKPOINTS).is_dir():
-            raise unfinished(path)
+        check_finished(path)
         inside = ", ".join(sorted(p.name for p in path.glob("*.onnx"))[:5]) or "none"
         raise ExpertError(
             f"{path} is a folder (ONNX files inside: {inside})",
