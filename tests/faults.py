@@ -322,6 +322,7 @@ FAULTS = {
         301: "constraints of a run that evaluates nothing",
         302: "choices of a log, written as whole numbers",
         303: "a finished run with checkpoints that could not be dropped",
+        304: "an export in eight bits, on a processor whose sums of them overflow",
     },
 }
 

@@ -156,6 +156,9 @@ def test_a_gif_keeps_the_pace_that_viewers_show(tmp_path):
     class Fast(Drawn):
         metadata = {"render_modes": ["rgb_array"], "render_fps": 125}  # noqa: RUF012
 
+        def __init__(self):
+            super().__init__(wall=99)
+
     for every, seconds in ((1, 0.32), (2, 0.32)):
         file = fdtasil.render({"p": push}, Fast, tmp_path / "f.gif", horizon=40, every=every)
         film, shown = Image.open(file), []

@@ -200,6 +200,7 @@ def test_weights_that_are_none(tmp_path):
             PlainPolicy.load(tmp_path / "s.safetensors")
 
 
+@pytest.mark.fault(304)
 @pytest.mark.parametrize("activation", ACTIVATIONS)
 def test_in_eight_bits_it_is_a_quarter_and_nearly_the_same(activation):
     student = make((64, 64), activation)
@@ -212,6 +213,9 @@ def test_in_eight_bits_it_is_a_quarter_and_nearly_the_same(activation):
     (answers,) = session.run(["actions"], {"obs": rows})
     assert 0 < np.abs(answers - student.act(rows)).mean() < 0.1
     assert data == export(student, rows, {"a": "b"}, "student.int8.onnx")
+    # Signed ones overflow where a processor adds products in 16 bits: seen on AVX2 without VNNI.
+    weights = [one for one in onnx.load_from_string(data).graph.initializer if len(one.dims) == 2]
+    assert {one.data_type for one in weights} == {onnx.TensorProto.UINT8}
 
 
 @pytest.mark.fault(222)

@@ -135,7 +135,8 @@ def test_the_students_own_graph_is_small_and_can_be_quantised(activation, tmp_pa
     onnx.checker.check_model(model, full_check=True)
     assert not model.graph.value_info
     assert sum(node.op_type == "Gemm" for node in model.graph.node) == 3
-    quantize_dynamic(plain, small)
+    # Processors without VNNI add pairs of products in 16 bits, which eight-bit weights overflow.
+    quantize_dynamic(plain, small, reduce_range=True)
     answers = fdtasil.load_expert(small, 5, 2).ask(ROWS, "act")
     assert np.abs(answers - student.act(ROWS)).max() < 0.1
 

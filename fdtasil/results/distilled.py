@@ -164,7 +164,7 @@ class Distilled:
         if self.steps_seen > 1 or not whole:
             raise ExportError(
                 "a student that sees another thing than the observation as an agent",
-                "one that sees it whole, as the agent will",
+                "one that sees the whole observation, as the agent will",
                 "go on with the student's own weights",
             )
         return agent_of(self.student, env, algorithm, seed)
