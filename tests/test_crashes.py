@@ -299,13 +299,19 @@ def mutate(data, random):
 def test_every_mutated_file_of_ours_is_detected(count, expert, tmp_path, figure):
     fdtasil.distill(expert, TOY, out=tmp_path, **SHORT)
     files = [path for path in sorted(tmp_path.rglob("*")) if path.is_file()]
+    card = b'  "README.md"'  # which may be completed by hand, so that its hash says nothing
+    files.remove(tmp_path / "README.md")
     assert len(files) > 7
     random_, mutated = random.Random(0), 0
     while mutated < count:
         path = random_.choice(files)
         whole = path.read_bytes()
         changed = mutate(whole, random_)
-        if changed == whole:
+        before, after = (
+            [line for line in data.split(b"\n") if not line.startswith(card)]
+            for data in (whole, changed)
+        )
+        if before == after:
             continue
         mutated += 1
         path.write_bytes(changed)

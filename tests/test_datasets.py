@@ -309,6 +309,7 @@ def test_whole_numbers_of_a_log_may_be_choices():
         with pytest.warns(FdtasilWarning, match=r"np\.eye\(2\)\[chosen\] - 1 / 2"):
             fdtasil.from_arrays(states, chosen)
     fdtasil.from_arrays(states, np.arange(50)[:, None])  # a position in steps of a motor
+    fdtasil.from_arrays(states, np.arange(50)[:, None] % 3 - 1)  # no choice is -1
 
 
 def test_who_has_neither_answers_nor_an_expert_is_told_so(quick):

@@ -84,7 +84,8 @@ def from_arrays(
 
 def _warn_of_choices(actions: np.ndarray) -> None:
     """Warn of actions that seem to be numbers of choices: as such, 2 is no mean of 1 and 3."""
-    if actions.dtype.kind in "bui" and len(chosen := np.unique(actions)) <= _CHOICES:
+    chosen = np.unique(actions)
+    if actions.dtype.kind in "bui" and chosen[0] >= 0 and len(chosen) <= _CHOICES:
         count = int(chosen[-1]) + 1
         warn(
             f"actions of {actions.dtype} are learnt as numbers; if they are choices, from 0 on, "

@@ -6,7 +6,7 @@ import numpy as np
 
 from fdtasil.demonstrations.states import Demonstrations
 from fdtasil.errors import warn
-from fdtasil.probes.scales import Scales
+from fdtasil.probes.scales import ROUNDING, Scales
 from fdtasil.probes.source import Probes
 from fdtasil.probes.spread import stands_still
 from fdtasil.rollouts.behaviours import Policy
@@ -143,7 +143,8 @@ def warn_of_rounded_movement(lesson: Lesson) -> None:
     """
     sizes = np.abs(lesson.dataset.demonstrations.observations).max(axis=0)
     still, deviations = lesson.scales.seen & ~lesson.scales.live, lesson.scales.deviation
-    found = np.flatnonzero(still & (deviations > _CLEARLY * np.spacing(sizes)))
+    offset = (_CLEARLY * np.spacing(sizes) < deviations) & (deviations <= ROUNDING * sizes)
+    found = np.flatnonzero(still & offset)
     if not len(found):
         return
     told, more = _listed(found, deviations)

@@ -177,7 +177,7 @@ def middle_of(low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
     The half is less where middle and half together would be rounded beyond a bound.
     """
-    low, high = low.astype(np.float64), high.astype(np.float64)
+    low, high = (bound.astype(np.float32).astype(np.float64) for bound in (low, high))
     with np.errstate(invalid="ignore"):
         centre = ((high + low) / 2).astype(np.float32)
         inside = np.minimum(high - centre, centre - low)
