@@ -247,6 +247,7 @@ def test_other_probes_than_the_stored_ones_are_asked_where_somebody_answers(line
     stored = fdtasil.distill(linear, TOY, "sphere:2", **QUICK).dataset
     with pytest.warns(FdtasilWarning, match=r"'sphere:2,.* are not used: .* anew, 'sphere:5"):
         more = fdtasil.distill(linear, TOY, "sphere:5", dataset=stored, **SMALL)
+    assert any("are not used" in one for one in more.report["warnings"])
     alone = replace(stored, probes=None, answers=None)
     expected = fdtasil.distill(linear, TOY, "sphere:5", dataset=alone, **SMALL)
     assert more.answers.values.shape[1] == 5
@@ -306,10 +307,15 @@ def test_movement_beside_an_offset_that_is_left_out_is_warned_of(deviation, told
 def test_whole_numbers_of_a_log_may_be_choices():
     states = np.random.default_rng(0).standard_normal((50, 3))
     for chosen in ((states[:, :1] > 0), (states[:, :1] > 0).astype(int)):
-        with pytest.warns(FdtasilWarning, match=r"np\.eye\(2\)\[chosen\] - 1 / 2"):
+        with pytest.warns(FdtasilWarning, match=r"write scores: np\.eye\(2\)") as told:
             fdtasil.from_arrays(states, chosen)
+        advice = str(told[0].message).partition("scores: ")[2]
+        scores = eval(advice, {"np": np, "actions": chosen})
+        assert fdtasil.from_arrays(states, scores).sizes == (3, 2)
     fdtasil.from_arrays(states, np.arange(50)[:, None])  # a position in steps of a motor
     fdtasil.from_arrays(states, np.arange(50)[:, None] % 3 - 1)  # no choice is -1
+    fdtasil.from_arrays(states, np.full((50, 1), 1000))
+    fdtasil.from_arrays(states, np.ones((50, 2), int))
 
 
 def test_who_has_neither_answers_nor_an_expert_is_told_so(quick):

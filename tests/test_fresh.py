@@ -21,6 +21,7 @@ from fdtasil.probes.scales import measure_scales
 from fdtasil.probes.source import Probes
 from fdtasil.probes.spread import Spread, stands_still
 from fdtasil.probes.surroundings import Surroundings
+from fdtasil.results.summary import call_of
 from fdtasil.run.presets import PRESETS
 from fdtasil.seeding import episode_seeds
 from fdtasil.student.fit import Fit
@@ -604,3 +605,22 @@ def test_a_budget_says_how_many_probes_fit():
     fdtasil.distill(linear, TOY, source.format(7), max_queries=800, **QUICK)
     with pytest.raises(SettingError, match="7 probes fit"):
         fdtasil.distill(linear, TOY, source.format(8), max_queries=800, **QUICK)
+
+
+@pytest.mark.fault(297)
+def test_said_deviations_stay_where_probes_go_as_far():
+    run = {"fit": fdtasil.Fit(steps=5), "student": fdtasil.Mlp(4), "progress": False}
+    recorded = {"episodes": 1, "horizon": 20, "evaluation_episodes": 0}
+    first = fdtasil.distill(follows, Commanded, 2, spread={4: 0.58}, **recorded, **run)
+    for probes, kept in ((3, {"4": 0.58}), ("3,raw,radius=0.01", None)):
+        with pytest.warns(FdtasilWarning, match="are not used"):
+            again = fdtasil.distill(follows, None, probes, dataset=first.dataset, **run)
+        assert again.dataset.spread.to_json() == kept
+    with (
+        pytest.warns(FdtasilWarning, match="are not used"),
+        pytest.raises(SettingError, match="which no probe moves"),
+    ):
+        fdtasil.distill(follows, None, 3, dataset=first.dataset, student_obs=[0, 1], **run)
+    bounds = fdtasil.distill(follows, Commanded, 0, spread="bounds", **recorded, **run).dataset
+    alone = fdtasil.distill(None, None, 0, dataset=bounds, **run)
+    assert "spread" not in call_of(alone.settings, 1)

@@ -482,16 +482,16 @@ def test_a_second_push_is_a_second_commit_and_changes_no_access(writable, quick_
 def test_no_file_of_an_earlier_run_stays_beside_the_next(writable, quick_folder, inside):
     assert inside("push", quick_folder, "me/toy", "--demonstrations").returncode == 0
     repository = writable.repositories["me/toy"]
-    repository.commit({**pushed(writable), "LICENSE": b"mine", "figures/own.svg": b"mine"})
+    repository.commit({**pushed(writable), "LICENSE": b"mine", "figures/own.png": b"mine"})
     done = inside("push", quick_folder, "me/toy")
     assert done.returncode == 0, done.stderr
     files = pushed(writable)
     assert (
         not {"demonstrations.npz", "config.json", "progress.csv", "manifest.json"} & files.keys()
     )
-    assert {"LICENSE", "figures/own.svg", *CARD} <= files.keys()
+    assert {"LICENSE", "figures/own.png", *CARD} <= files.keys()
     for name in ("demonstrations.npz", "manifest.json"):
-        assert re.search(rf"removed  {name}, of an earlier run", done.stdout)
+        assert re.search(rf"removed  {name}, of an earlier push", done.stdout)
     assert "LICENSE" not in done.stdout
 
 

@@ -10,7 +10,7 @@ from conftest import GAIN, QUICK, TOY, mlp_onnx
 
 import fdtasil
 from fdtasil import Fit
-from fdtasil.errors import ExpertError, FdtasilWarning, SettingError
+from fdtasil.errors import ExpertError, FdtasilWarning, SettingError, StorageError
 from fdtasil.run.folder import RunFolder
 
 FILES = (
@@ -274,3 +274,22 @@ def test_a_run_whose_checkpoints_could_not_be_dropped_is_finished(expert, tmp_pa
     again = fdtasil.distill(expert, TOY, 2, resume=tmp_path / "run", callback=told.append, **run)
     assert told == []
     assert again.student.to_bytes() == first.student.to_bytes()
+
+
+@pytest.mark.fault(303)
+def test_a_finished_run_is_not_handed_out_for_the_one_that_begins_in_its_place(
+    expert, tmp_path, monkeypatch
+):
+    run = {**QUICK, "progress": False}
+    fdtasil.distill(expert, TOY, 2, out=tmp_path / "run", **run)
+
+    def full(folder, files):
+        raise StorageError("no space", "room", "free some")
+
+    with monkeypatch.context() as patch:
+        patch.setattr("fdtasil.run.folder.write_folder", full)
+        with pytest.raises(StorageError, match="no space"):
+            fdtasil.distill(expert, TOY, 0, seed=7, out=tmp_path / "run", **run)
+    assert (tmp_path / "run" / "checkpoints" / "config.json").exists()
+    again = fdtasil.distill(expert, TOY, 0, seed=7, resume=tmp_path / "run", **run)
+    assert again.settings["seed"] == 7

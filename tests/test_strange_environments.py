@@ -275,7 +275,7 @@ def test_where_two_long_observations_are_apart_is_told():
     assert told == "its first observation from seed 3 was [1.0], is [7.0] at coordinate 6"
     (told,) = other_environment(before | {"observation": [1.0] * 8}, now)
     assert told.endswith("had 8 numbers, has 9")
-    for junk in ("x", [None] * 9, [[]] * 9, [10**400] * 9):
+    for junk in ("x", [None] * 9, [[]] * 9, [[0] * 9, [9] * 9] * 5, [[0] * 9] * 9, [10**400] * 9):
         assert len(other_environment(before | {"observation": junk}, now)) == 1
 
 

@@ -14,7 +14,7 @@ from fdtasil.rollouts.spaces import to_numpy
 
 __all__ = ["from_arrays"]
 
-_CHOICES = 20  # different whole numbers at most, that may be those of choices
+_CHOICES = 20  # of how many there is a choice at most, where actions are whole numbers
 
 
 def from_arrays(
@@ -78,18 +78,18 @@ def from_arrays(
     narrowing.see(wide, rows)
     narrowing.judge_a_log()
     warn_of_bounds(found)
-    _warn_of_choices(to_numpy(actions))
+    _warn_of_choices(labels)
     return found
 
 
 def _warn_of_choices(actions: np.ndarray) -> None:
     """Warn of actions that seem to be numbers of choices: as such, 2 is no mean of 1 and 3."""
-    chosen = np.unique(actions)
-    if actions.dtype.kind in "bui" and chosen[0] >= 0 and len(chosen) <= _CHOICES:
-        count = int(chosen[-1]) + 1
+    least, count = int(actions.min()), int(actions.max()) + 1
+    single = actions.dtype.kind in "bui" and actions.shape[1] == 1
+    if single and least >= 0 and least + 1 < count <= _CHOICES:
         warn(
             f"actions of {actions.dtype} are learnt as numbers; if they are choices, from 0 on, "
-            f"write scores: np.eye({count})[chosen] - 1 / {count}"
+            f"write scores: np.eye({count})[actions[:, 0].astype(int)] - 1 / {count}"
         )
 
 

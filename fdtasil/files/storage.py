@@ -130,11 +130,13 @@ def _change(folder: Path, files: Mapping[str, bytes], kept: Mapping[str, str]) -
 
 
 def _written_by_us(folder: Path) -> set[str]:
-    """Return the files that an earlier call wrote and nobody has changed; none if in doubt."""
-    try:
-        return set(_verified(folder, None))
-    except StorageError:
-        return set()
+    """Return the files that an earlier call wrote and nobody has changed."""
+    found = set[str]()
+    with contextlib.suppress(StorageError):
+        for name in _manifest(folder):
+            with contextlib.suppress(StorageError):
+                found |= _verified(folder, [name]).keys()
+    return found
 
 
 def verify(
@@ -195,8 +197,11 @@ def _verified(
         raise
     except OSError as error:
         raise _unreadable(folder, error) from error
-    checked = files.keys() - edited
-    changed = [name for name in files if name in checked and sha256(files[name]) != manifest[name]]
+    changed = [
+        name
+        for name, data in files.items()
+        if name not in edited and sha256(data) != manifest[name]
+    ]
     if changed:
         raise StorageError(
             f"{folder}: {', '.join(changed)} changed after writing",

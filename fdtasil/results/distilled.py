@@ -211,7 +211,8 @@ class Distilled:
                 without it a student of one can be asked, but not exported.
 
         Raises:
-            StorageError: If a file is missing, changed since, or not one of ours.
+            StorageError: If a file is missing, changed since (but for the card), or not one of
+                ours.
         """
         read = reads(
             f"a run in {folder}",

@@ -12,8 +12,9 @@ from typing import TYPE_CHECKING
 from fdtasil.errors import ExportError, SettingError, first_line
 from fdtasil.experts.hub.requests import endpoint, patience
 from fdtasil.files.reading import FILE_LIMIT, read_plain
-from fdtasil.files.run_format import CARD, check_finished
+from fdtasil.files.run_format import CARD, CONFIG, check_finished
 from fdtasil.files.storage import MANIFEST, verify
+from fdtasil.results.figures import FIGURES
 
 if TYPE_CHECKING:
     from huggingface_hub import HfApi
@@ -23,11 +24,7 @@ __all__ = ["left_over", "look_up", "open_hub", "parcel_of", "send"]
 _NAME = re.compile(r"[\w.-]+/[\w.-]+", re.ASCII)
 _SENT = (CARD, "report.json", "student.", "figures/")
 _ALWAYS = {"report.json", "student.safetensors"}  # in every repository that a run was sent to
-_RUN = re.compile(
-    r"README\.md|(report|config|manifest)\.json|student\.(onnx|safetensors)|figures/\w+\.png|"
-    r"demonstrations\.npz|progress\.csv",
-    re.ASCII,
-)
+_DATA = {CONFIG, MANIFEST, "demonstrations.npz", "progress.csv", "student.onnx"}
 _TIMES_OF_A_REQUEST = 2  # that the patience is long: a request's own limit is the last resort
 
 
@@ -116,14 +113,15 @@ def look_up(hub: "HfApi", repository: str, *, public: bool) -> set[str] | None:
 
 
 def left_over(there: Collection[str] | None, files: Collection[str]) -> list[str]:
-    """Return which files of an earlier run in a repository the new one does not replace.
+    """Return which files of an earlier push are in a repository, and are not sent now.
 
-    They are none of the new run's: demonstrations of another expert beside its student, say. What
-    is not a run's is left alone, and so is all in a repository that no run was sent to.
+    Demonstrations of another expert would stand beside the new student, say. What is not a run's
+    is left alone, and so is all in a repository that no run was sent to.
     """
     if there is None or not set(there) >= _ALWAYS:
         return []
-    return sorted(name for name in there if _RUN.fullmatch(name) and name not in files)
+    ours = _ALWAYS | _DATA | {f"figures/{name}.png" for name in FIGURES}
+    return sorted((ours & set(there)) - set(files))
 
 
 def send(

@@ -74,7 +74,8 @@ def call_of(settings: Mapping[str, Any], history: int) -> str:
         given.append(f"student_obs={'student_obs' if 'student_obs' in lost else repr(seen)}")
     if settings.get("keep") not in (None, "all"):
         given.append(f"keep={settings['keep']!r}")
-    if settings.get("spread"):
+    of_the_dataset = data and not env and "bounds" in (settings.get("spread") or {})
+    if settings.get("spread") and not of_the_dataset:
         given.append(f"spread={_spread(settings['spread'])!r}")
     if history > 1:
         given.append(f"history={history}")

@@ -196,7 +196,8 @@ def _changed(before: Any, now: list[float]) -> str:
     if len(now) <= _LISTED or not isinstance(before, list):
         return f"was {_some(before)}, is {_some(now)}"
     try:
-        place = int(np.abs(np.subtract(before, now, dtype=np.float64)).argmax())
+        was = np.asarray(before, np.float64).reshape(len(now))
+        place = int(np.abs(was - now).argmax())
     except (TypeError, ValueError, OverflowError):  # a file that was changed
         place = 0
     return f"was {_some(before[place])}, is {_some(now[place])} at coordinate {place}"

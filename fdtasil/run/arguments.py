@@ -334,7 +334,9 @@ def _without_other_answers(
         f"the stored answers to {stored.describe()!r} are not used: the expert is asked anew, "
         f"{asked.describe()!r}"
     )
-    return replace(given, probes=None, answers=None)
+    # No raw probe goes as far as somebody said.
+    spread = given.spread if asked.space != "raw" else Spread({})
+    return replace(given, probes=None, answers=None, spread=spread)
 
 
 def _source_anew(

@@ -176,7 +176,8 @@ class Configuration:
         """Rows that the evaluation asks at most, and the look that follows it."""
         if self.expert is None or not self.horizon:
             return 0
-        return self.evaluation_episodes * self.horizon + self._asked_again
+        steps = self.evaluation_episodes * self.horizon
+        return steps * (1 + (self.remembered > 0)) + self._asked_again
 
     @property
     def _asked_again(self) -> int:

@@ -118,8 +118,16 @@ class RunFolder:
     @property
     def finished(self) -> bool:
         """Whether the folder holds a finished run."""
-        # What could not be dropped of its checkpoints may be left.
-        return self._path is not None and not self.begun and is_written(self._path)
+        if self._path is None or self.begun or not is_written(self._path):
+            return False
+        # What is left of checkpoints may be its own, or of another run that begins in its place.
+        left = inside(self._path, f"{CHECKPOINTS}/{CONFIG}")
+        files = left, inside(self._path, CONFIG)
+        mine, theirs = (
+            read_plain(file, _CONFIG_LIMIT, follow=False) if left.exists() else b""
+            for file in files
+        )
+        return mine == theirs
 
     def save(
         self, round_: int, stage: str, number: int, files: Callable[[], dict[str, bytes]]

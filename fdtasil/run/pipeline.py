@@ -185,34 +185,36 @@ def distill(
     check_history(history, student_obs)
     if env is None:
         _check_nothing_to_step(horizon=horizon, constraints=constraints)
-    if limits is not None and (expert is None or evaluation_episodes == 0):
+    if limits and (expert is None or evaluation_episodes == 0):
         raise SettingError(
             f"constraints= {'without an expert' if expert is None else 'and no evaluation'}",
             "an evaluation, which counts where they are violated",
             f"{'pass expert=' if expert is None else 'raise evaluation_episodes='}, or leave "
             "constraints= out",
         )
-    arguments = read_arguments(
-        given,
-        probes,
-        can_ask=expert is not None,
-        trainer=trainer,
-        episodes=episodes,
-        horizon=horizon,
-        seed=seed,
-        student=student,
-        student_obs=student_obs,
-        keep=keep,
-        spread=spread,
-        fit=fit,
-        preset=preset,
-        evaluation_episodes=evaluation_episodes,
-        max_queries=max_queries,
-        device=device,
-    )
+    with heard_warnings() as early:
+        arguments = read_arguments(
+            given,
+            probes,
+            can_ask=expert is not None,
+            trainer=trainer,
+            episodes=episodes,
+            horizon=horizon,
+            seed=seed,
+            student=student,
+            student_obs=student_obs,
+            keep=keep,
+            spread=spread,
+            fit=fit,
+            preset=preset,
+            evaluation_episodes=evaluation_episodes,
+            max_queries=max_queries,
+            device=device,
+        )
     given, told = arguments.given, tell_all(callback)
     chosen = pick_device(arguments.device)
     with heard_warnings() as notes, open_subject(expert, env, given, history) as subject:
+        notes += early
         going_on = asked_anew(folder) if folder is not None and resume is not None else None
         layout = subject.spaces.observations if subject.spaces else None
         student_obs = named(student_obs, layout)
@@ -223,7 +225,7 @@ def distill(
             given = showing(given, history, subject.actions)
         arguments = replace(arguments, given=given, student_obs=student_obs)
         run, bars = arguments.configure(subject, going_on), Progress(progress)
-        run.check_spread(given.spread if given is not None else None)
+        run.check_spread(given.spread if given is not None and run.probes_given else None)
         run.check_budget()
         usual = arguments.preset.fit
         warn_of_idle_weights(run.fit, usual, run.probes, calibrated=run.calibrated)

@@ -37,6 +37,6 @@ def command(
     for name, data in sorted(files.items()):
         print(f"  {len(data):12,} bytes  {name}")
     for name in left_over(there, files):
-        print(f"  {'removed':>18}  {name}, of an earlier run; its history keeps it")
+        print(f"  {'removed':>18}  {name}, of an earlier push; the history keeps it")
     print("The card and the report name your expert as you did, with its path.", flush=True)
     print(f"sent: {send(hub, repository, files, there, public=public)}")
