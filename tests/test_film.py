@@ -169,6 +169,14 @@ def test_a_gif_keeps_the_pace_that_viewers_show(tmp_path):
         assert sum(shown[:-1]) == pytest.approx(1000 * seconds, abs=20)
 
 
+@pytest.mark.fault(298)
+def test_a_file_that_sees_through_a_function_is_not_filmed_without_it(tmp_path):
+    run = {**QUICK, "student_obs": lambda rows: 3 * rows, "progress": False}
+    written = fdtasil.distill(push, TOY, 0, **run).export(tmp_path / "s.onnx")
+    with pytest.raises(SettingError, match=r"sees through the function .*file does not hold"):
+        fdtasil.render({"student": written}, Drawn, tmp_path / "f.gif", horizon=5)
+
+
 def test_where_an_episode_ends_is_shown(tmp_path):
     drawn = []
 

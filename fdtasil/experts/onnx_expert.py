@@ -33,7 +33,7 @@ from fdtasil.rollouts.spaces import Layout, Spaces
 if TYPE_CHECKING:
     import onnx
 
-__all__ = ["COLUMNS", "FUNCTION", "HISTORY", "open_onnx", "said_function", "said_history"]
+__all__ = ["COLUMNS", "FUNCTION", "HISTORY", "open_onnx", "said_history"]
 
 COLUMNS, FUNCTION = "fdtasil.observation_columns", "fdtasil.observation_function"
 """Metadata entry of an exported student that sees some coordinates only."""
@@ -134,31 +134,22 @@ def said_history(source: object) -> int:
 
     Raises:
         ExpertError: If it is a file that can't be read.
+        SettingError: If it sees through a function, without which its answers mean nothing.
     """
-    text = _texts_of(source).get(HISTORY, "1")
-    return int(text) if text.isascii() and text.isdigit() and 0 < int(text) < _LONGEST else 1
-
-
-def said_function(source: object) -> str | None:
-    """Return the name of the function that an exported student says that it sees through.
-
-    Args:
-        source: As in `said_history`.
-
-    Raises:
-        ExpertError: If it is a file that can't be read.
-    """
-    return _texts_of(source).get(FUNCTION)
-
-
-def _texts_of(source: object) -> dict[str, str]:
-    """Return what an ONNX file says of itself; nothing of anything else."""
     if not isinstance(source, str | Path) or Path(source).suffix != ".onnx":
-        return {}
+        return 1
     if "://" in str(source):  # of the hub, or a server: its path says it when it is here
-        return {}
+        return 1
     model, _ = read_model(Path(source))
-    return {entry.key: entry.value for entry in model.metadata_props}
+    texts = {entry.key: entry.value for entry in model.metadata_props}
+    if FUNCTION in texts:
+        raise SettingError(
+            f"a student that sees through {shown(texts[FUNCTION])}, which its file does not hold",
+            "the function itself",
+            "pass student_obs=, or a function of whole observations that calls both",
+        )
+    text = texts.get(HISTORY, "1")
+    return int(text) if text.isascii() and text.isdigit() and 0 < int(text) < _LONGEST else 1
 
 
 _LONGEST = 1000

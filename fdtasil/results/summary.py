@@ -118,10 +118,10 @@ def _environment(settings: Mapping[str, Any]) -> str | None:
 
 def _in_no_file(settings: Mapping[str, Any]) -> dict[str, str]:
     """Return the arguments that a reader has to make again, by name, with what they were."""
-    expert, env, data = settings["expert"], _environment(settings), settings.get("dataset")
+    env, data = _environment(settings), settings.get("dataset")
     seen = settings.get("student_obs")
     found = {
-        "expert": _expert_in_words(expert, settings),
+        "expert": _expert_in_words(settings),
         "env": _environment_in_words(env, settings.get("made")),
         "dataset": data and f"sha256 {data}",
         "student_obs": seen if isinstance(seen, str) else None,  # a function
@@ -129,13 +129,13 @@ def _in_no_file(settings: Mapping[str, Any]) -> dict[str, str]:
     return {name: said for name, said in found.items() if said is not None}
 
 
-def _expert_in_words(name: str | None, settings: Mapping[str, Any]) -> str | None:
+def _expert_in_words(settings: Mapping[str, Any]) -> str | None:
     """Return what an expert is; None where its file or address alone tells."""
+    name = settings["expert"]
     if settings.get("opened"):
         return f"{name}, opened with {settings['opened']}"
-    if settings.get("expert_sha256") or is_http_url(name) or is_hub_uri(name):
-        return None
-    return settings["expert"]
+    known = settings.get("expert_sha256") or is_http_url(name) or is_hub_uri(name)
+    return None if known else settings["expert"]
 
 
 def _environment_in_words(name: str | None, made: str | None) -> str | None:

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from fdtasil.errors import EnvironmentFault, SettingError, warn
+from fdtasil.errors import EnvironmentFault, FdtasilError, SettingError, warn
 
 __all__ = ["Narrowing"]
 
@@ -29,20 +29,27 @@ class Narrowing:
         np.maximum(self._high, wide.max(axis=0), out=self._high)
         np.maximum(self._lost, np.abs(wide - narrow).max(axis=0), out=self._lost)
 
-    def judge(self) -> None:
+    def judge(
+        self,
+        raised: type[FdtasilError] = EnvironmentFault,
+        advice: str = "subtract a constant in gymnasium.wrappers.TransformObservation",
+    ) -> None:
         """Warn of coordinates whose movement is rounded away.
 
+        Args:
+            raised: What is raised where that are all that move.
+            advice: What to do.
+
         Raises:
-            EnvironmentFault: If that are all that move.
+            FdtasilError: If that are all that move.
         """
         found, whole = self._found()
         if found is None:
             return
-        advice = "subtract a constant in gymnasium.wrappers.TransformObservation"
         if not whole:
             warn(f"{found}: {advice}")
             return
-        raise EnvironmentFault(
+        raise raised(
             found, "observations whose movement float32 can hold: experts are asked in it", advice
         )
 
@@ -52,14 +59,9 @@ class Narrowing:
         Raises:
             SettingError: If that are all that move.
         """
-        found, whole = self._found()
-        if found is None:
-            return
-        advice = "subtract a constant from the column, and where the student runs too"
-        if not whole:
-            warn(f"{found}: {advice}")
-            return
-        raise SettingError(found, "observations whose movement float32 can hold", advice)
+        self.judge(
+            SettingError, "subtract a constant from the column, and where the student runs too"
+        )
 
     def _found(self) -> tuple[str | None, bool]:
         """Return what is rounded away, in words, and whether nothing else moves."""

@@ -157,6 +157,7 @@ def fingerprint(pool: EnvironmentPool, seed: int) -> dict[str, Any] | None:
     }
 
 
+_KEPT = 64  # numbers of an observation, in a fingerprint
 _LISTED = 4
 _SHOWN = {
     "observation": "its first observation",
@@ -200,7 +201,8 @@ def _changed(before: Any, now: list[float]) -> str:
         place = int(np.abs(was - now).argmax())
     except (TypeError, ValueError, OverflowError):  # a file that was changed
         place = 0
-    return f"was {_some(before[place])}, is {_some(now[place])} at coordinate {place}"
+    where = f" at coordinate {place}" if len(now) < _KEPT else ""  # of more, not all are kept
+    return f"was {_some(before[place])}, is {_some(now[place])}{where}"
 
 
 def _some(values: Any) -> str:
@@ -315,6 +317,6 @@ def _layers(environment: gymnasium.Env) -> Iterator[gymnasium.Env]:
 
 
 def _written(values: np.ndarray) -> list[float]:
-    """Return up to 64 numbers, evenly spread, with six digits: more than rounding leaves."""
-    chosen = values[np.linspace(0, len(values) - 1, min(len(values), 64)).astype(int)]
+    """Return some of the numbers, evenly spread, with six digits: more than rounding leaves."""
+    chosen = values[np.linspace(0, len(values) - 1, min(len(values), _KEPT)).astype(int)]
     return [float(f"{value:.6g}") for value in chosen]

@@ -122,11 +122,10 @@ class RunFolder:
             return False
         # What is left of checkpoints may be its own, or of another run that begins in its place.
         left = inside(self._path, f"{CHECKPOINTS}/{CONFIG}")
-        files = left, inside(self._path, CONFIG)
-        mine, theirs = (
-            read_plain(file, _CONFIG_LIMIT, follow=False) if left.exists() else b""
-            for file in files
-        )
+        if not left.exists():
+            return True
+        now = inside(self._path, CONFIG)
+        mine, theirs = (read_plain(file, _CONFIG_LIMIT, follow=False) for file in (now, left))
         return mine == theirs
 
     def save(

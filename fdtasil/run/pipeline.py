@@ -185,13 +185,8 @@ def distill(
     check_history(history, student_obs)
     if env is None:
         _check_nothing_to_step(horizon=horizon, constraints=constraints)
-    if limits and (expert is None or evaluation_episodes == 0):
-        raise SettingError(
-            f"constraints= {'without an expert' if expert is None else 'and no evaluation'}",
-            "an evaluation, which counts where they are violated",
-            f"{'pass expert=' if expert is None else 'raise evaluation_episodes='}, or leave "
-            "constraints= out",
-        )
+    if limits:
+        _check_evaluated(expert, evaluation_episodes)
     with heard_warnings() as early:
         arguments = read_arguments(
             given,
@@ -261,6 +256,21 @@ def _check_nothing_to_step(**asked: object) -> None:
                 "nothing that is recorded or evaluated",
                 f"pass env=, or leave {name}= out",
             )
+
+
+def _check_evaluated(expert: ExpertLike | None, episodes: int) -> None:
+    """Refuse constraints where nothing is evaluated.
+
+    Raises:
+        SettingError: If it is not.
+    """
+    if expert is None or episodes == 0:
+        raise SettingError(
+            f"constraints= {'without an expert' if expert is None else 'and no evaluation'}",
+            "an evaluation, which counts where they are violated",
+            f"{'pass expert=' if expert is None else 'raise evaluation_episodes='}, or leave "
+            "constraints= out",
+        )
 
 
 def _folder_of(out: str | Path | None, resume: str | Path | None) -> Path | None:
