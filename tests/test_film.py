@@ -90,6 +90,31 @@ def test_students_of_every_form(tmp_path):
     ).exists()
 
 
+def test_runs_are_filmed_by_their_results_and_their_folders(tmp_path):
+    law = lambda x: np.clip(-x[:, :2], -1, 1)  # noqa: E731
+    past = fdtasil.distill(law, Drawn, 2, **QUICK, history=2)
+    some = fdtasil.distill(law, Drawn, 0, **QUICK, student_obs=lambda rows: rows[:, :2])
+    past.save(tmp_path / "run")
+    film = fdtasil.render(
+        {"result": some, "folder": tmp_path / "run"}, Drawn, tmp_path / "f.gif", horizon=3
+    )
+    assert Image.open(film).n_frames > 1
+    shown = (fdtasil.render({"x": one}, Drawn, tmp_path / "x.gif", horizon=3) for one in
+             (past, str(tmp_path / "run")))  # fmt: skip
+    one, other = (file.read_bytes() for file in shown)
+    assert one == other
+
+
+def test_an_environment_that_breaks_is_told_as_everywhere(tmp_path):
+    class Breaks(Drawn):
+        def step(self, action):
+            observation, *rest = super().step(action)
+            return observation * np.nan, *rest
+
+    with pytest.raises(EnvironmentFault, match=r"step 0: .* not finite"):
+        fdtasil.render({"a": rest}, Breaks, tmp_path / "f.gif", horizon=3)
+
+
 @pytest.mark.parametrize(
     ("policies", "env", "out", "kind"),
     [

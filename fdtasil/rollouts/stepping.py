@@ -1,6 +1,6 @@
 """Episodes side by side, step by step: one batch of decisions for all that still go on."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
@@ -8,7 +8,7 @@ from fdtasil.rollouts.behaviours import Behaviour, Decision
 from fdtasil.rollouts.playing import Playing
 from fdtasil.rollouts.recording import Recording
 
-__all__ = ["step_together"]
+__all__ = ["step_by_step", "step_together"]
 
 
 def step_together(
@@ -29,8 +29,33 @@ def step_together(
         horizon: T, steps after which an episode is cut.
         on_step: Told the number of environment steps just done.
     """
+    for going in step_by_step(record, playing, playing.begin(), behaviour, noise, horizon):
+        on_step(len(going))
+
+
+def step_by_step(
+    record: Recording,
+    playing: Playing,
+    batch: np.ndarray,
+    behaviour: Behaviour,
+    noise: Sequence[np.random.Generator],
+    horizon: int,
+) -> Iterator[np.ndarray]:
+    """Play episodes as `step_together` does, a step whenever one is asked for.
+
+    Args:
+        record: Where they are recorded.
+        playing: Where they are played.
+        batch: (E, n) their first observations.
+        behaviour: Who acts.
+        noise: Generators handed to it, by the number of the episode.
+        horizon: T, steps after which an episode is cut.
+
+    Yields:
+        After each step (B,) bool, which of the episodes that took it go on. One that ends
+        for want of an answer takes no step.
+    """
     alive = playing.episodes
-    batch = playing.begin()
     for step in range(horizon):
         decision = behaviour(batch, [noise[e] for e in alive])
         if decision.silent is not None:
@@ -42,7 +67,7 @@ def step_together(
                 break
         allowed = record.decide(alive, step, batch, decision)
         after, going = playing.step(alive, allowed, step)
-        on_step(len(alive))
+        yield going
         if going.all():
             batch = after
             continue

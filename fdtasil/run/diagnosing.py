@@ -12,7 +12,7 @@ from fdtasil.compute import torch_settings
 from fdtasil.errors import ExpertError, SettingError
 from fdtasil.experts.examination import examine
 from fdtasil.experts.expert import Expert
-from fdtasil.experts.load import ExpertLike, expert_in, sized
+from fdtasil.experts.load import ExpertLike, expert_in
 from fdtasil.probes.calibration import calibrate
 from fdtasil.probes.scales import Scales, action_units, measure_scales
 from fdtasil.progress import Progress
@@ -32,15 +32,15 @@ from fdtasil.rollouts.environments import (
 from fdtasil.rollouts.episodes import Episodes
 from fdtasil.rollouts.rollout import rollout
 from fdtasil.run.judging import (
+    acting,
     finished_run,
     judged_in,
     judged_through,
     warn_of_another_environment,
 )
 from fdtasil.run.presets import PRESETS
-from fdtasil.run.subject import visible
 from fdtasil.seeding import episode_seeds, generator
-from fdtasil.student.view import StudentObservation, View, view_size
+from fdtasil.student.view import StudentObservation, view_size
 
 __all__ = ["diagnose"]
 
@@ -114,7 +114,8 @@ def diagnose(
         asked, judged = _opened(expert, looked_at, student_obs, pool)
         own = examine(asked, pool, starts, length, bars, force=force)
         visited = own.observations[own.valid]
-        act = _acting(judged, student_obs, visited, pool)
+        m = pool.boxes.action_size
+        act = acting(judged, student_obs, visited, m, purpose="check")
         warn_of_another_environment(student, pool)
         pair = _Pair(pool, asked, act, measure_scales(visited), _units(pool), starts, seed)
         pair.check_movable()
@@ -145,18 +146,6 @@ def _opened(
             "a policy with a memory", "two that depend on the observation", "see evaluate()"
         )
     return asked, judged
-
-
-def _acting(
-    judged: Expert,
-    student_obs: StudentObservation | None,
-    visited: np.ndarray,
-    pool: EnvironmentPool,
-) -> Policy:
-    """Return the student as a function of all that is observed."""
-    seen = judged.columns if student_obs is None else student_obs
-    view = View.of(visible(seen, pool.boxes.observation_size, 0), visited[:256])
-    return view.policy(sized(judged, view.size, pool.boxes.action_size).policy("check"))
 
 
 def _units(pool: EnvironmentPool) -> np.ndarray:

@@ -8,7 +8,7 @@ from fdtasil.errors import SettingError
 from fdtasil.experts.carrying import carry
 from fdtasil.experts.examination import examine
 from fdtasil.experts.gate import large_batch
-from fdtasil.experts.load import ExpertLike, expert_in, sized
+from fdtasil.experts.load import ExpertLike, expert_in
 from fdtasil.progress import Progress
 from fdtasil.results.constraints import Constraints, check_constraints
 from fdtasil.results.distilled import Distilled
@@ -18,15 +18,16 @@ from fdtasil.rollouts.behaviours import follow_answers
 from fdtasil.rollouts.environments import EnvironmentLike, EnvironmentPool, resolve_horizon
 from fdtasil.rollouts.history import past_size
 from fdtasil.run.judging import (
+    acting,
     check_history,
     finished_run,
     judged_in,
     judged_through,
     warn_of_another_environment,
 )
-from fdtasil.run.subject import named, visible
+from fdtasil.run.subject import named
 from fdtasil.seeding import episode_seeds
-from fdtasil.student.view import StudentObservation, View, view_size
+from fdtasil.student.view import StudentObservation, view_size
 
 __all__ = ["evaluate"]
 
@@ -95,16 +96,11 @@ def evaluate(
                 "a policy without one",
                 "compare it as the expert: evaluate(student, it, env)",
             )
-        black_box, past, remembered = carry(black_box, pool, history)
-        n += past + remembered
+        black_box, _, remembered = carry(black_box, pool, history)
         starts = episode_seeds(seed, "evaluation", 0, count)
         most = large_batch(count, black_box.chunk)
         theirs = examine(black_box, pool, starts, length, bars, force=force, largest=most)
-        student_obs = judged.columns if student_obs is None else student_obs
-        seen = visible(student_obs, n, remembered)
-        view = View.of(seen, theirs.observations[theirs.valid][:256])
-        answer = view.policy(sized(judged, view.size, m).policy("evaluate"))
+        visited = theirs.observations[theirs.valid]
+        student = follow_answers(acting(judged, student_obs, visited, m, remembered=remembered))
         warn_of_another_environment(policy, pool)
-        acting = follow_answers(answer)
-        own = n - past - remembered
-        return evaluate_pair(acting, black_box, theirs, pool, length, seed, bars, limits, own)
+        return evaluate_pair(student, black_box, theirs, pool, length, seed, bars, limits, n)

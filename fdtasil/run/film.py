@@ -17,16 +17,24 @@ from fdtasil.checks import check_count, check_path, check_suffix
 from fdtasil.errors import EnvironmentFault, ExportError, SettingError, first_line
 from fdtasil.experts.carrying import carry
 from fdtasil.experts.load import ExpertLike, sized
-from fdtasil.experts.onnx_expert import said_history
 from fdtasil.files.storage import write_bytes
 from fdtasil.progress import Progress
-from fdtasil.rollouts.behaviours import has_none
-from fdtasil.rollouts.environments import EnvironmentLike, EnvironmentPool, resolve_horizon
+from fdtasil.results.distilled import Distilled
+from fdtasil.rollouts.behaviours import Policy, follow_answers
+from fdtasil.rollouts.environments import (
+    EnvironmentLike,
+    EnvironmentPool,
+    resolve_horizon,
+    simulator_warnings,
+)
 from fdtasil.rollouts.history import WithHistory
-from fdtasil.rollouts.recording import HOLD
+from fdtasil.rollouts.playing import InTurn
+from fdtasil.rollouts.recording import Recording
+from fdtasil.rollouts.rollout import first_observations
+from fdtasil.rollouts.stepping import step_by_step
 from fdtasil.rollouts.wanted import Environment
-from fdtasil.run.judging import judged_in
-from fdtasil.student.view import View
+from fdtasil.run.judging import acting, finished_run, judged_in, judged_through
+from fdtasil.student.view import view_size
 
 __all__ = ["choose_renderer", "render"]
 
@@ -37,7 +45,7 @@ _LAST = 1.0  # seconds that the last picture stands
 
 
 def render(
-    policies: Mapping[str, ExpertLike],
+    policies: Mapping[str, ExpertLike | Distilled],
     env: EnvironmentLike,
     out: str | Path,
     *,
@@ -50,7 +58,8 @@ def render(
     """Film policies side by side, from one start, with the return so far above each.
 
     Args:
-        policies: By the name that stands above each: a student, an exported file, an expert.
+        policies: By the name that stands above each: a result, the folder of a run,
+            or anything else that an expert may be.
         env: A gymnasium id, an `Environment`, or a function that makes an environment with
             `render_mode="rgb_array"`.
         out: Ends with .mp4 (`pip install "fdtasil[video]"`), .webp or .gif.
@@ -76,15 +85,17 @@ def render(
     check_count("seed", seed, 0, 2**32 - 1)
     every, height = check_count("every", every), check_count("height", height, 32)
     bars = Progress(progress)
-    with ExitStack() as open_, bars.bar("film", "picture", 1) as bar:
-        players = [open_.enter_context(_Player(*pair, env, seed)) for pair in policies.items()]
+    with ExitStack() as open_, bars.bar("film", "picture", 1) as bar, simulator_warnings():
+        players = [
+            open_.enter_context(_Player(*pair, env, seed, horizon)) for pair in policies.items()
+        ]
         if len({id(player.simulator) for player in players}) < len(players):
             raise SettingError(
                 "a function that returns one and the same environment",
                 "a new one for each policy",
                 "make it inside the function: lambda: gymnasium.make(...)",
             )
-        steps = resolve_horizon(horizon, players[0].pool)
+        steps = players[0].horizon
         bar.lengthen(len(range(0, steps, every)))
         pictures = _pictures(players, steps, every, height, bar.move)
         fps = players[0].fps / every
@@ -102,12 +113,17 @@ def choose_renderer() -> None:
 
 
 class _Player:
-    """A policy in an environment of its own."""
+    """A policy in an environment of its own, and the episode that it plays."""
 
-    def __init__(self, name: str, policy: ExpertLike, env: EnvironmentLike, seed: int) -> None:
-        self.name, self.seed, self.total, self.step, self.over = str(name), seed, 0.0, 0, False
-        self._last: np.ndarray | None = None
-        self._silent = 0  # steps without an answer
+    def __init__(
+        self,
+        name: str,
+        policy: ExpertLike | Distilled,
+        env: EnvironmentLike,
+        seed: int,
+        horizon: int | None,
+    ) -> None:
+        self.name, self.over = str(name), False
         self.pool = EnvironmentPool(_drawing(env))
         try:
             if self.pool.together is not None:
@@ -116,10 +132,15 @@ class _Player:
                     "one environment for each policy",
                     "pass its id, or a function that makes one",
                 )
-            self._act = _acting(policy, self.pool)
+            self.horizon = resolve_horizon(horizon, self.pool)
+            act = follow_answers(_policy_in(policy, self.pool, seed))
             (self._env,) = self.pool.take(1)
             _follow(self._env)
-            self._seen = np.asarray(self._env.reset(seed=seed, **self.pool.reset_options)[0])
+            self._record = Recording([seed], self.horizon, self.pool)
+            playing = InTurn(self._record, {0: self._env})
+            noise = [np.random.default_rng(seed)]
+            first = playing.begin()
+            self._steps = step_by_step(self._record, playing, first, act, noise, self.horizon)
             self.picture = self._drawn()
         except BaseException:
             self.pool.close()
@@ -137,24 +158,22 @@ class _Player:
         """What is stepped, without its wrappers."""
         return self._env.unwrapped
 
+    @property
+    def total(self) -> float:
+        """The return so far."""
+        return float(self._record.rewards[0].sum())
+
+    @property
+    def step(self) -> int:
+        """How many steps it has taken."""
+        return int(self._record.valid[0].sum())
+
     def move(self) -> None:
-        """Take a step; an episode that is over stands still, and one without an answer goes on."""
+        """Take a step; an episode that is over stands still."""
         if self.over:
             return
-        answer = self._act(self._seen[None].astype(np.float32))
-        none = bool(has_none(answer)[0])
-        self._silent = self._silent + 1 if none else 0
-        if self._silent > HOLD:
-            self.over = True
-            return
-        if not none:
-            self._last = answer
-        # At the start there is no last action: the one nearest to none.
-        acted = np.zeros_like(answer) if self._last is None else self._last
-        action = self.pool.bounds.put_inside(acted)[0][0]
-        self._seen, reward, terminated, truncated, _ = self._env.step(action)
-        self.total, self.step = self.total + float(reward), self.step + 1
-        self.over = bool(terminated or truncated)
+        going = next(self._steps, None)
+        self.over = going is None or not going[0]
         if self.over:  # where it ended is shown, whatever pictures are left out
             self.picture = self._drawn()
 
@@ -215,18 +234,19 @@ def _drawing(env: EnvironmentLike) -> EnvironmentLike:
     return wanted
 
 
-def _acting(policy: ExpertLike, pool: EnvironmentPool) -> Callable[[np.ndarray], np.ndarray]:
+def _policy_in(policy: ExpertLike | Distilled, pool: EnvironmentPool, seed: int) -> Policy:
     """Return what answers the environment's flat observations."""
-    history, layout = said_history(policy), pool.spaces.actions
+    looked_at, student_obs, history = judged_through(finished_run(policy), None, 1)
     if history > 1:
+        layout = pool.spaces.actions
         pool.wrap(lambda made: WithHistory(made, history, layout))
     n, m = pool.boxes.observation_size, pool.boxes.action_size
-    judged = judged_in(policy, pool, n, whole=history == 1)
-    if judged.columns is not None:
-        view = View.of(judged.columns, np.zeros((1, n), np.float32))
-        return view.policy(sized(judged, view.size, m).policy("evaluate"))
-    opened, _, _ = carry(sized(judged, n, m), pool)
-    return opened.policy("evaluate")
+    whole = student_obs is None and history == 1
+    judged = judged_in(looked_at, pool, view_size(student_obs, n), whole=whole)
+    if student_obs is None and judged.columns is None:
+        opened, _, _ = carry(sized(judged, n, m), pool)
+        return opened.policy("evaluate")
+    return acting(judged, student_obs, first_observations(pool, [seed]), m)
 
 
 def _pictures(

@@ -9,18 +9,21 @@ import numpy as np
 
 from fdtasil.checks import check_count
 from fdtasil.errors import SettingError, warn
-from fdtasil.experts.expert import Expert, Hints
-from fdtasil.experts.load import ExpertLike, open_expert
+from fdtasil.experts.expert import Expert, Hints, Purpose
+from fdtasil.experts.load import ExpertLike, open_expert, sized
 from fdtasil.experts.onnx_expert import said_history
 from fdtasil.experts.structure import in_spaces
 from fdtasil.results.distilled import Distilled
+from fdtasil.rollouts.behaviours import Policy
 from fdtasil.rollouts.environments import EnvironmentPool
 from fdtasil.rollouts.spaces import Spaces, flat_layout
 from fdtasil.rollouts.trials import fingerprint, other_environment
+from fdtasil.run.subject import visible
 from fdtasil.student.policy import Student
-from fdtasil.student.view import StudentObservation, Unseen
+from fdtasil.student.view import StudentObservation, Unseen, View
 
 __all__ = [
+    "acting",
     "check_history",
     "finished_run",
     "judged_in",
@@ -103,6 +106,30 @@ def judged_in(
     if spaces is not None and (not whole or judged.columns is not None):
         spaces = Spaces(flat_layout(size or 1), spaces.actions)
     return in_spaces(judged, spaces)
+
+
+def acting(
+    judged: Expert,
+    student_obs: StudentObservation | None,
+    states: np.ndarray,
+    action_size: int,
+    *,
+    remembered: int = 0,
+    purpose: Purpose = "evaluate",
+) -> Policy:
+    """Return a policy that is judged, as a function of all that is observed.
+
+    Args:
+        judged: From `judged_in`.
+        student_obs: What it sees; None for what it says itself, or all.
+        states: (B, n) observations, which a function of them is tried on.
+        action_size: m.
+        remembered: Of n, how many numbers are the memory of the expert beside it.
+        purpose: That its rows are counted under.
+    """
+    seen = judged.columns if student_obs is None else student_obs
+    view = View.of(visible(seen, states.shape[1], remembered), states[:256])
+    return view.policy(sized(judged, view.size, action_size).policy(purpose))
 
 
 def check_history(history: object, student_obs: object) -> int:

@@ -60,7 +60,8 @@ command = as_command(
         "policies": (
             _Policies,
             Parameter.empty,
-            "NAME=FILE of each, in their order from the left: an ONNX file, a zip, an address.",
+            "NAME=FILE of each, in their order from the left: an ONNX file, a zip, an address, "
+            "the folder of a run.",
         ),
         "out": (Path, Path("film.mp4"), "Ends with .mp4, .webp or .gif."),
         **MADE_FLAGS,
