@@ -323,6 +323,7 @@ FAULTS = {
         302: "choices of a log, written as whole numbers",
         303: "a finished run with checkpoints that could not be dropped",
         304: "an export in eight bits, on a processor whose sums of them overflow",
+        305: "the address of a file, in the place of a server's",
     },
 }
 

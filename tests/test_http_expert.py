@@ -307,6 +307,21 @@ def test_addresses_that_are_none(address):
         fdtasil.load_expert(address)
 
 
+@pytest.mark.fault(305)
+@pytest.mark.parametrize(
+    ("address", "step"),
+    [
+        ("https://huggingface.co/org/repo/blob/main/a/walker.onnx", "write hf://org/repo/a/walk"),
+        ("https://hf.co/org/repo/resolve/v1/ppo.zip?download=true", "ppo.zip@v1"),
+        ("http://host:8000/models/walker.ONNX", "download the file"),
+    ],
+)
+def test_the_address_of_a_file_is_no_server(address, step):
+    with pytest.raises(ExpertError, match="the address of a file") as caught:
+        fdtasil.load_expert(address)
+    assert step in str(caught.value)
+
+
 def test_a_password_is_refused_and_not_shown():
     with pytest.raises(ExpertError, match="holds a password") as caught:
         fdtasil.load_expert("http://me:secret@127.0.0.1/act")

@@ -16,6 +16,7 @@ import numpy as np
 
 from fdtasil.errors import ExpertError, first_line, shown, without_secrets
 from fdtasil.experts.expert import Expert
+from fdtasil.experts.hub.uri import uri_of_page
 
 __all__ = ["is_http_url", "open_http"]
 
@@ -71,6 +72,13 @@ def _parse(url: str) -> SplitResult:
         raise _no_address(url, "its host or port can't be read") from None
     if not usable:
         raise _no_address(url, "no host, or characters that have to be quoted")
+    if parts.path.lower().endswith((".onnx", ".zip")):
+        uri = uri_of_page(url)
+        raise ExpertError(
+            f"{without_secrets(url)} is the address of a file",
+            "the address of a server that answers with actions",
+            f"write {uri}" if uri else "download the file, and name its path",
+        )
     if parts.username is not None or parts.password is not None:
         # Said without the address: it would print the password.
         raise ExpertError(

@@ -242,7 +242,9 @@ def _unreadable(folder: Path, problem: object) -> StorageError:
     if isinstance(problem, OSError) and problem.filename is not None:
         text = f"{text}: {Path(problem.filename).name}"
     return StorageError(
-        f"{folder}: {text}", "a folder written by save()", "check the path, or save again"
+        f"{folder}: {text}",
+        "the folder of a finished run, from save() or out= (--out)",
+        "check the path, or save again",
     )
 
 

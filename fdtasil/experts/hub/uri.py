@@ -8,7 +8,7 @@ from typing import TypeGuard
 from fdtasil.errors import ExpertError
 from fdtasil.files.names import stays_inside
 
-__all__ = ["COMMIT", "HubUri", "is_hub_uri", "malformed", "parse"]
+__all__ = ["COMMIT", "HubUri", "is_hub_uri", "malformed", "parse", "uri_of_page"]
 
 _SCHEME = "hf:"
 # The hub's own names for other kinds of repositories come first in their URIs.
@@ -18,6 +18,11 @@ _URI = re.compile(
     re.ASCII,
 )
 COMMIT = re.compile(r"[0-9a-f]{40}")
+_PAGE = re.compile(
+    r"https?://(?:www\.)?(?:huggingface\.co|hf\.co)/(?P<repo>[\w.-]+/[\w.-]+)/"
+    r"(?:blob|resolve|raw)/(?P<revision>[^/?#]+)/(?P<file>[^?#]+)(?:[?#].*)?",
+    re.ASCII,
+)
 
 
 @dataclass(frozen=True)
@@ -52,6 +57,17 @@ def parse(text: str) -> HubUri:
     if not found or not all(stays_inside(found[part]) for part in ("repo", "file")):
         raise malformed(text)
     return HubUri(found["repo"], str(PurePosixPath(found["file"])), found["revision"])
+
+
+def uri_of_page(url: str) -> str | None:
+    """Return the URI of a file whose address on the hub's own site is known, or None.
+
+    Example:
+        >>> uri_of_page("https://huggingface.co/org/repo/blob/main/walker.onnx")
+        'hf://org/repo/walker.onnx@main'
+    """
+    found = _PAGE.fullmatch(url)
+    return found and str(HubUri(found["repo"], found["file"], found["revision"]))
 
 
 def malformed(text: str) -> ExpertError:
