@@ -8,7 +8,7 @@ import numpy as np
 from benchmarks.controllers import available
 from benchmarks.distillation import recorded
 from benchmarks.grid import SEEDS
-from benchmarks.robustness import compare_under_disturbances
+from benchmarks.robustness import compare_under_disturbances, shares_under
 from benchmarks.runner import Benchmark, Cell, Row
 from benchmarks.statistics import (
     DIFFERENCES_NOTE,
@@ -64,7 +64,7 @@ def draw(rows: Sequence[Row]) -> dict[str, bytes]:
     lines, gains = [], []
     for expert in dict.fromkeys(row["cell"]["expert"] for row in rows):
         for name in DISTURBED:
-            shares = _shares(rows, expert, name)
+            shares = shares_under(rows, expert, name, METHODS)
             theirs = list(shares.pop("expert").values())
             if any(len(found) < 2 for found in shares.values()):
                 continue
@@ -77,18 +77,6 @@ def draw(rows: Sequence[Row]) -> dict[str, bytes]:
     heads = ["expert", "physics", "the expert", *METHODS, f"{SPREAD} - {FRESH}"]
     text = f"{SCORES_NOTE}\n{DIFFERENCES_NOTE}\n{table(heads, lines)}"
     return {"masses.md": text.encode()}
-
-
-def _shares(rows: Sequence[Row], expert: str, name: str) -> dict[str, dict[int, float]]:
-    """Return column -> seed -> share of the undisturbed expert's return."""
-    shares: dict[str, dict[int, float]] = {column: {} for column in ("expert", *METHODS)}
-    for row in rows:
-        cell, result = row["cell"], row["result"]
-        if cell["expert"] == expert:
-            whole = result["none"]["expert_return"]
-            shares[cell["method"]][cell["seed"]] = result[name]["student_return"] / whole
-            shares["expert"][cell["seed"]] = result[name]["expert_return"] / whole
-    return shares
 
 
 BENCHMARK = Benchmark("masses", __doc__ or "", cells, run, draw)

@@ -16,7 +16,7 @@ from benchmarks.grid import SEEDS, STANDARD_METHODS, experts, label
 from benchmarks.runner import Benchmark, Cell, Row
 from benchmarks.scores import Column, Scores, scores_text
 
-__all__ = ["BENCHMARK"]
+__all__ = ["BENCHMARK", "compare_under_disturbances", "shares_under"]
 
 EPISODES = 5
 EVALUATED = 10  # episodes under each disturbance
@@ -151,7 +151,7 @@ def _scores(rows: Sequence[Row]) -> Scores:
             continue
         for name in DISTURBANCES:
             if all(_counts(results[key][name]) for key in keys):
-                scores[expert, name] = _shares(results, expert, name)
+                scores[expert, name] = shares_under(rows, expert, name, STUDENTS)
     return scores
 
 
@@ -161,20 +161,21 @@ def _counts(result: Mapping[str, Any]) -> bool:
     )
 
 
-def _shares(
-    results: Mapping[tuple[str, str, int], Mapping[str, Any]], expert: str, disturbance: str
+def shares_under(
+    rows: Sequence[Row], expert: str, disturbance: str, methods: Sequence[str]
 ) -> dict[str, dict[int, float]]:
     """Return column -> seed -> share of the undisturbed expert's return."""
-    shares: dict[str, dict[int, float]] = {column: {} for column in COLUMNS}
-    for seed in SEEDS:
-        for method in STUDENTS:
-            result = results[expert, method, seed]
-            whole, found = result["none"]["expert_return"], result[disturbance]
-            shares[method][seed] = found["student_return"] / whole
-            theirs = found["expert_return"] / whole
-            # Equal seeds, equal disturbances: every student's cell has the same expert.
-            if abs(shares["expert"].setdefault(seed, theirs) - theirs) > 1e-9:
-                raise ValueError(f"{expert}, {disturbance}, seed {seed}: the expert differs")
+    shares: dict[str, dict[int, float]] = {column: {} for column in ("expert", *methods)}
+    for row in sorted(rows, key=lambda row: row["cell"]["seed"]):
+        cell, result, seed = row["cell"], row["result"], row["cell"]["seed"]
+        if cell["expert"] != expert:
+            continue
+        whole, found = result["none"]["expert_return"], result[disturbance]
+        shares[cell["method"]][seed] = found["student_return"] / whole
+        theirs = found["expert_return"] / whole
+        # Equal seeds, equal disturbances: every student's cell has the same expert.
+        if abs(shares["expert"].setdefault(seed, theirs) - theirs) > 1e-9:
+            raise ValueError(f"{expert}, {disturbance}, seed {seed}: the expert differs")
     return shares
 
 
