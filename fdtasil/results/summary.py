@@ -77,7 +77,7 @@ def call_of(settings: Mapping[str, Any], history: int) -> str:
     of_the_dataset = data and not env and "bounds" in (settings.get("spread") or {})
     if settings.get("spread") and not of_the_dataset:
         given.append(f"spread={_spread(settings['spread'])!r}")
-    if history > 1:
+    if history > 1 or data:  # left out, it is what the dataset shows
         given.append(f"history={history}")
     given.append(f"evaluation_episodes={settings['evaluation_episodes']}")
     student = dict(settings["student"])

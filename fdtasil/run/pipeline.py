@@ -6,7 +6,7 @@ from pathlib import Path
 
 import torch
 
-from fdtasil.checks import check_count, check_flag, check_path
+from fdtasil.checks import check_flag, check_path
 from fdtasil.compute import pick_device, torch_settings
 from fdtasil.demonstrations.dataset import Dataset, DatasetLike, load_dataset
 from fdtasil.demonstrations.past import showing
@@ -44,7 +44,7 @@ from fdtasil.run.judging import check_history
 from fdtasil.run.lesson import Lesson
 from fdtasil.run.report import config_of, no_answer, report_of
 from fdtasil.run.rounds import Rounds
-from fdtasil.run.subject import Subject, bounded, history_with, named, open_subject, visible
+from fdtasil.run.subject import Subject, bounded, named, open_subject, visible
 from fdtasil.run.training import Training
 from fdtasil.seeding import episode_seeds
 from fdtasil.student.architectures import Architecture
@@ -65,7 +65,7 @@ def distill(
     seed: int = 0,
     student: Architecture | str | None = None,
     student_obs: StudentObservation | None = None,
-    history: int = 1,
+    history: int | None = None,
     keep: str = "all",
     spread: SpreadLike | None = None,
     fit: Fit | None = None,
@@ -124,7 +124,7 @@ def distill(
         history: How many observations the student sees, with the actions between them; more than
             one for an expert with a memory, or an environment that hides speeds. Of a dataset,
             those before stand in the rows before. Probes move the present one. `fdtasil.History`
-            keeps them where the student runs.
+            keeps them where the student runs. Left out, 1, or as many as `dataset` shows.
         keep: Which of the expert's own episodes are learnt from: "all", or "survivors", which
             records others (three at most) in the place of each that the environment ended.
         spread: How far coordinates will go on the machine that stand still in the demonstrations,
@@ -181,8 +181,8 @@ def distill(
     limits = None if constraints is None else check_constraints(constraints)
     progress = check_flag("progress", progress)
     given = None if dataset is None else load_dataset(dataset)
-    history = history_with(check_count("history", history), given)
-    check_history(history, student_obs)
+    shown = 1 if given is None else given.history
+    history = check_history(shown if history is None else history, student_obs)
     if env is None:
         _check_nothing_to_step(horizon=horizon, constraints=constraints)
     if limits:

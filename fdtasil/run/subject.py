@@ -21,7 +21,7 @@ from fdtasil.rollouts.naming import columns_named
 from fdtasil.rollouts.spaces import Layout, Spaces, flat_layout
 from fdtasil.student.view import StudentObservation, describe_view
 
-__all__ = ["Subject", "bounded", "history_with", "named", "open_subject", "visible"]
+__all__ = ["Subject", "bounded", "named", "open_subject", "visible"]
 
 _ROUNDING = 1e-5  # of the largest score
 
@@ -180,11 +180,6 @@ def _centred(states: Demonstrations, actions: Layout) -> Demonstrations:
     if np.allclose(centred, states.actions, rtol=0, atol=_ROUNDING * np.abs(centred).max()):
         return states
     return replace(states, actions=centred)
-
-
-def history_with(history: int, given: Dataset | None) -> int:
-    """Return how many observations a student sees: as many as a dataset shows, if none is said."""
-    return given.history if given is not None and history == 1 else history
 
 
 def named(
