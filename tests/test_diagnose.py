@@ -328,10 +328,24 @@ def test_what_can_not_be_diagnosed():
     chosen = in_form(linear(GAIN), "box", "choice")
     with pytest.raises(SettingError, match="choices"):
         fdtasil.diagnose(chosen, chosen, lambda: InForm("box", "choice"), horizon=10)
-    run = {"episodes": 2, "horizon": 20, "evaluation_episodes": 0, "fit": fdtasil.Fit(steps=5)}
-    remembers = fdtasil.distill(linear(GAIN), TOY, 0, history=2, **run)
-    with pytest.raises(SettingError, match="sees 2 observations"):
-        fdtasil.diagnose(remembers, linear(GAIN), TOY, horizon=20)
+
+
+def test_a_student_that_sees_the_past_is_moved_in_the_present(tmp_path):
+    expert, look = linear(GAIN), {"episodes": 2, "horizon": 20, "progress": False}
+    run = {"student": fdtasil.Mlp(32), "evaluation_episodes": 0, **look, "episodes": 8}
+    few, many = (
+        fdtasil.distill(expert, TOY, 10, history=2, fit=fdtasil.Fit(steps=steps), **run)
+        for steps in (5, 400)
+    )
+    poor, found = (fdtasil.diagnose(result, expert, TOY, **look) for result in (few, many))
+    plain = fdtasil.diagnose(expert, expert, TOY, **look)
+    assert 2 * found.fidelity.error < poor.fidelity.error
+    assert found.stability == plain.stability  # of the expert, in its own observations
+    assert plain.conditions
+    assert not found.conditions and found.errors is None and found.linearisation is None  # noqa: PT018
+    file = many.export(tmp_path / "s.onnx")
+    alike = fdtasil.diagnose(file, expert, TOY, **look).fidelity.errors
+    assert alike == pytest.approx(found.fidelity.errors, rel=1e-3)
 
 
 def test_the_command(tmp_path, inside):

@@ -40,12 +40,14 @@ class Diagnosis:
         unanswered: Share of the student's states at which the expert has no answer.
         queries: Rows that the expert answered.
         linearisation: Eigenvalues of both closed loops along the expert's path; None where the
-            environment is no MuJoCo environment of gymnasium, or its actions are no controls.
+            environment is no MuJoCo environment of gymnasium, its actions are no controls, or the
+            student sees a past.
         errors: Of the student's action and derivative at states of the expert's first steps, as
-            the theorems ask for; None where no law was found, the expert answers in steps or has
-            no answer around them, or not one coordinate moves, or more than 1,000.
+            the theorems ask for; None where no law was found, the student sees a past, the expert
+            answers in steps or has no answer around them, or not one coordinate moves, or more
+            than 1,000.
         conditions: TaSIL's statements that are about such a loop, with these constants; none where
-            no law was found, or the expert answers in steps.
+            no law was found, the student sees a past, or the expert answers in steps.
         regime: How the expert answers: "smooth", "noisy" or "steps", as in `Calibration`; None
             where it has no answers around its states, or always the same.
     """

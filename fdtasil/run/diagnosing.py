@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -10,6 +10,7 @@ import torch
 from fdtasil.checks import check_count, check_flag
 from fdtasil.compute import torch_settings
 from fdtasil.errors import ExpertError, SettingError
+from fdtasil.experts.carrying import carry
 from fdtasil.experts.examination import examine
 from fdtasil.experts.expert import Expert
 from fdtasil.experts.load import ExpertLike, expert_in
@@ -30,6 +31,7 @@ from fdtasil.rollouts.environments import (
     simulator_warnings,
 )
 from fdtasil.rollouts.episodes import Episodes
+from fdtasil.rollouts.history import past_size
 from fdtasil.rollouts.rollout import rollout
 from fdtasil.run.judging import (
     acting,
@@ -64,7 +66,7 @@ def diagnose(
     """Measure how well a student's derivatives are its expert's, and what the expert forgives.
 
     Nothing is trained, and the student may be anybody's: a result or the folder of a run, an ONNX
-    file, a function.
+    file, a function. Of one that sees several observations, the present one is moved alone.
     The expert is asked some eleven thousand times beside its episodes, and 48 times more for each
     coordinate where its loop follows a law.
 
@@ -103,21 +105,20 @@ def diagnose(
     followed, force = check_count("steps", steps), check_flag("force", force)
     student = finished_run(student)
     looked_at, student_obs, history = judged_through(student, None, 1)
-    if history > 1:
-        raise SettingError(
-            f"a student that sees {history} observations", "one that sees one", "see evaluate()"
-        )
     with EnvironmentPool(env) as pool, torch_settings(torch.device("cpu")):
         _check_numbers(pool)
         length = resolve_horizon(horizon, pool)
         starts = episode_seeds(seed, "evaluation", 0, count)
-        asked, judged = _opened(expert, looked_at, student_obs, pool)
+        present = np.arange(pool.boxes.observation_size)
+        asked, judged = _opened(expert, looked_at, student_obs, pool, history)
         own = examine(asked, pool, starts, length, bars, force=force)
         visited = own.observations[own.valid]
         m = pool.boxes.action_size
         act = acting(judged, student_obs, visited, m, purpose="check")
         warn_of_another_environment(student, pool)
-        pair = _Pair(pool, asked, act, measure_scales(visited), _units(pool), starts, seed)
+        scales = measure_scales(visited)
+        scales = replace(scales, live=scales.live & np.isin(np.arange(visited.shape[1]), present))
+        pair = _Pair(pool, asked, act, scales, _units(pool), starts, seed, history > 1)
         pair.check_movable()
         return pair.diagnose(own, min(followed, length))
 
@@ -137,15 +138,17 @@ def _opened(
     student: ExpertLike,
     student_obs: StudentObservation | None,
     pool: EnvironmentPool,
+    history: int,
 ) -> tuple[Expert, Expert]:
-    """Return both policies, neither of which has a memory."""
-    asked, n = expert_in(expert, pool), pool.boxes.observation_size
-    judged = judged_in(student, pool, view_size(student_obs, n), whole=student_obs is None)
+    """Return both policies, neither of which has a memory, in a pool that shows the past."""
+    asked, n, m = expert_in(expert, pool), pool.boxes.observation_size, pool.boxes.action_size
+    size, whole = n + past_size(history, n, m), student_obs is None and history == 1
+    judged = judged_in(student, pool, view_size(student_obs, size), whole=whole)
     if asked.memory is not None or judged.memory is not None:
         raise SettingError(
             "a policy with a memory", "two that depend on the observation", "see evaluate()"
         )
-    return asked, judged
+    return carry(asked, pool, history)[0], judged
 
 
 def _units(pool: EnvironmentPool) -> np.ndarray:
@@ -163,10 +166,11 @@ class _Pair:
         pool: The environment.
         expert: Who is asked.
         act: (B, n) -> (B, m) of the student.
-        scales: Of the states that the expert visits.
+        scales: Of the states that the expert visits; of a past behind them nothing is live.
         units: (m,) that actions are measured in.
         starts: Seeds of the episodes.
         seed: Of directions and disturbances.
+        shows_past: Whether the student sees more than the present observation.
     """
 
     pool: EnvironmentPool
@@ -176,6 +180,7 @@ class _Pair:
     units: np.ndarray
     starts: Sequence[int]
     seed: int
+    shows_past: bool
 
     @property
     def _held(self) -> tuple[int, ...]:
@@ -211,7 +216,9 @@ class _Pair:
         with simulator_warnings():
             loops = linearise(pool, answers, self.act, self.starts[:_LOOKED], looked)
         regime = self._regime(own)
-        law, errors = None if regime == "steps" else stability.law, None
+        # The theorems are about students that see the present alone.
+        beyond = regime == "steps" or self.shows_past
+        law, errors = None if beyond else stability.law, None
         if law is not None:
             random = generator(self.seed, "directions of the theorems")
             errors = errors_of(ours, theirs, first.spread(_NORMED), units, scales, random, held)
@@ -234,7 +241,7 @@ class _Pair:
     def _regime(self, own: Episodes) -> str | None:
         """Return how the expert answers; None where it does not, or always the same."""
         visited, boxes = own.observations[own.valid], self.pool.boxes
-        moved = ~np.isin(np.arange(visited.shape[1]), list(self._held))
+        moved = self.scales.live & ~np.isin(np.arange(visited.shape[1]), list(self._held))
         units = action_units(boxes.low, boxes.high, own.actions[own.valid])
         about = measure_scales(visited, moved), generator(self.seed, "calibration")
         with suppress(ExpertError):
