@@ -17,7 +17,7 @@ from fdtasil.files.arrays import arrays_from_bytes
 from fdtasil.files.border import reads
 from fdtasil.files.plain import as_kind
 from fdtasil.files.reading import from_json, read_plain
-from fdtasil.files.run_format import check_finished
+from fdtasil.files.run_format import STATES, check_finished
 from fdtasil.files.storage import is_written, verify
 from fdtasil.probes.answers import Answers
 from fdtasil.probes.source import Probes
@@ -152,7 +152,7 @@ def load_dataset(source: DatasetLike) -> Dataset:
             "of arrays: fdtasil.from_arrays(observations, actions, episode_ends=...)",
         )
     path = check_path("dataset", source)
-    file = path / "demonstrations.npz" if path.is_dir() else path
+    file = path / STATES if path.is_dir() else path
     check_finished(path)
     try:
         if path.is_dir() and is_written(path):

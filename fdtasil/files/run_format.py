@@ -17,6 +17,11 @@ __all__ = [
     "CHECKPOINTS",
     "COMMAND",
     "CONFIG",
+    "MODEL",
+    "PROGRESS",
+    "REPORT",
+    "STATES",
+    "WEIGHTS",
     "check_finished",
     "check_free",
     "stamped",
@@ -26,6 +31,8 @@ __all__ = [
 FORMAT = 1
 """Number of the files' layout: one more whenever older files can't be read any longer."""
 CONFIG, CHECKPOINTS, COMMAND = "config.json", "checkpoints", "command.json"
+WEIGHTS, MODEL = "student.safetensors", "student.onnx"
+STATES, PROGRESS, REPORT = "demonstrations.npz", "progress.csv", "report.json"
 CARD = "README.md"
 """What people complete by hand: a licence, whom to ask."""
 _STAMP = {"format": FORMAT, "made_by": "fdtasil"}

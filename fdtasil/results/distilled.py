@@ -20,7 +20,19 @@ from fdtasil.files.border import reads
 from fdtasil.files.lock import locked
 from fdtasil.files.plain import as_kind, without_infinities
 from fdtasil.files.reading import from_json
-from fdtasil.files.run_format import CARD, CONFIG, check_finished, check_free, stamped, unstamped
+from fdtasil.files.run_format import (
+    CARD,
+    CONFIG,
+    MODEL,
+    PROGRESS,
+    REPORT,
+    STATES,
+    WEIGHTS,
+    check_finished,
+    check_free,
+    stamped,
+    unstamped,
+)
 from fdtasil.files.storage import (
     add_to_folder,
     to_json,
@@ -142,7 +154,7 @@ class Distilled:
 
     def to_onnx(self, path: str | Path) -> Path:
         """Write the student as one ONNX file, whatever its name; see `export`."""
-        write_bytes(Path(path), self.export_bytes("student.onnx"))
+        write_bytes(Path(path), self.export_bytes(MODEL))
         return Path(path)
 
     def to_sb3(self, env: Any, algorithm: str = "SAC", seed: int = 0) -> Any:
@@ -192,7 +204,7 @@ class Distilled:
             StorageError: If a file can't be written, or the folder is none of these; finished
                 files stay whole.
         """
-        self.export_bytes("student.safetensors")  # what is spoilt is refused before all else
+        self.export_bytes(WEIGHTS)  # what is spoilt is refused before all else
         place = check_path("folder", folder).absolute()
         check_free(place)
         with locked(place, _PATIENCE):
@@ -228,14 +240,14 @@ class Distilled:
         settings = unstamped(files[CONFIG], folder / CONFIG, older=True)
         for name in _COUNTS & settings.keys():
             as_kind(int, settings[name], name)
-        report = _read_report(files["report.json"])
-        dataset = Dataset.from_bytes(files["demonstrations.npz"])
+        report = _read_report(files[REPORT])
+        dataset = Dataset.from_bytes(files[STATES])
         check_shapes(dataset)
         evaluation = report["evaluation"]
         return cls(
-            student=Student.from_bytes(files["student.safetensors"]),
+            student=Student.from_bytes(files[WEIGHTS]),
             evaluation=Evaluation.from_json(evaluation) if evaluation else None,
-            history=_read_csv(files["progress.csv"]),
+            history=_read_csv(files[PROGRESS]),
             queries=_read_queries(report["queries"]),
             settings=settings,
             report=report,
@@ -283,19 +295,19 @@ def write_run(result: Distilled, folder: Path) -> None:
         _note(notes, f"report.json has null for numbers that are not finite: {shown}")
     core = {
         CONFIG: stamped(result.settings),
-        "progress.csv": _csv(result.history),
-        "demonstrations.npz": result.dataset.to_bytes(),
-        "student.safetensors": result.export_bytes("student.safetensors"),
-        **_attempted({"student.onnx": lambda: result.export_bytes("student.onnx")}, notes),
+        PROGRESS: _csv(result.history),
+        STATES: result.dataset.to_bytes(),
+        WEIGHTS: result.export_bytes(WEIGHTS),
+        **_attempted({MODEL: lambda: result.export_bytes(MODEL)}, notes),
         CARD: card_of(result).encode(),
-        "report.json": _with_notes(report, notes),
+        REPORT: _with_notes(report, notes),
     }
     write_folder(folder, core)
     said = len(notes)
     drawn = {f"figures/{name}.png": _drawing(draw, result) for name, draw in FIGURES.items()}
     extra = _attempted(drawn, notes)
     if len(notes) > said:
-        extra["report.json"] = _with_notes(report, notes)
+        extra[REPORT] = _with_notes(report, notes)
     if extra:
         add_to_folder(folder, extra)
 

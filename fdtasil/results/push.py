@@ -12,7 +12,16 @@ from typing import TYPE_CHECKING
 from fdtasil.errors import ExportError, SettingError, first_line
 from fdtasil.experts.hub.requests import endpoint, patience
 from fdtasil.files.reading import FILE_LIMIT, read_plain
-from fdtasil.files.run_format import CARD, CONFIG, check_finished
+from fdtasil.files.run_format import (
+    CARD,
+    CONFIG,
+    MODEL,
+    PROGRESS,
+    REPORT,
+    STATES,
+    WEIGHTS,
+    check_finished,
+)
 from fdtasil.files.storage import MANIFEST, verify
 from fdtasil.results.figures import FIGURES
 
@@ -22,9 +31,9 @@ if TYPE_CHECKING:
 __all__ = ["left_over", "look_up", "open_hub", "parcel_of", "send"]
 
 _NAME = re.compile(r"[\w.-]+/[\w.-]+", re.ASCII)
-_SENT = (CARD, "report.json", "student.", "figures/")
-_ALWAYS = {"report.json", "student.safetensors"}  # in every repository that a run was sent to
-_DATA = {CONFIG, MANIFEST, "demonstrations.npz", "progress.csv", "student.onnx"}
+_SENT = (CARD, REPORT, "student.", "figures/")
+_ALWAYS = {REPORT, WEIGHTS}  # in every repository that a run was sent to
+_DATA = {CONFIG, MANIFEST, STATES, PROGRESS, MODEL}
 _TIMES_OF_A_REQUEST = 2  # that the patience is long: a request's own limit is the last resort
 
 

@@ -12,6 +12,7 @@ from fdtasil.demonstrations.dataset import Dataset, check_shapes
 from fdtasil.files.arrays import array_from_bytes
 from fdtasil.files.border import reads
 from fdtasil.files.reading import from_json
+from fdtasil.files.run_format import STATES, WEIGHTS
 from fdtasil.files.storage import to_json
 from fdtasil.probes.calibration import Calibration
 from fdtasil.run.account import Account, check_account
@@ -112,14 +113,14 @@ def _count(about: dict[str, Any], name: str) -> int:
 
 def _write_collected(now: Collected) -> Files:
     about = {"episodes": now.episodes, "counts": dict(now.counts)}
-    return {_ABOUT: to_json(about), "demonstrations.npz": now.dataset.to_bytes()}
+    return {_ABOUT: to_json(about), STATES: now.dataset.to_bytes()}
 
 
 @_STAGE
 def _read_collected(files: Files) -> Collected:
     about = from_json(files[_ABOUT])
     counts = {name: _count(about["counts"], name) for name in about["counts"]}
-    dataset = Dataset.from_bytes(files["demonstrations.npz"])
+    dataset = Dataset.from_bytes(files[STATES])
     check_shapes(dataset)
     return Collected(dataset, _count(about, "episodes"), Counter(counts))
 
@@ -149,7 +150,7 @@ def _read_halfway(files: Files) -> Halfway:
 
 def _write_trained(now: Trained) -> Files:
     about = {"history": now.history, "steps": now.steps}
-    return {_ABOUT: to_json(about), "student.safetensors": now.student.to_bytes()}
+    return {_ABOUT: to_json(about), WEIGHTS: now.student.to_bytes()}
 
 
 @_STAGE
@@ -158,7 +159,7 @@ def _read_trained(files: Files) -> Trained:
     check_history(about["history"])
     if not about["history"]:
         raise ValueError("a history without an entry")
-    student = Student.from_bytes(files["student.safetensors"])
+    student = Student.from_bytes(files[WEIGHTS])
     return Trained(student, about["history"], _count(about, "steps"))
 
 

@@ -13,6 +13,7 @@ from fdtasil.experts.expert import Expert, Hints, Purpose
 from fdtasil.experts.load import ExpertLike, open_expert, sized
 from fdtasil.experts.onnx_expert import said_history
 from fdtasil.experts.structure import in_spaces
+from fdtasil.files.run_format import WEIGHTS
 from fdtasil.results.distilled import Distilled
 from fdtasil.rollouts.behaviours import Policy
 from fdtasil.rollouts.environments import EnvironmentPool
@@ -38,7 +39,7 @@ def finished_run(policy: ExpertLike | Distilled) -> ExpertLike | Distilled:
     Raises:
         StorageError: If the folder is a run's, and damaged.
     """
-    if isinstance(policy, str | Path) and os.path.isfile(Path(policy) / "student.safetensors"):
+    if isinstance(policy, str | Path) and os.path.isfile(Path(policy) / WEIGHTS):
         return Distilled.load(policy)
     return policy
 
