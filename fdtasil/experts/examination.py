@@ -19,7 +19,12 @@ from fdtasil.experts.gate import (
 from fdtasil.experts.load import ExpertLike, expert_in
 from fdtasil.experts.memory import beginning_problem
 from fdtasil.progress import Progress
-from fdtasil.rollouts.behaviours import farthest_apart, follow_answers, random_behaviour
+from fdtasil.rollouts.behaviours import (
+    farthest_apart,
+    follow_answers,
+    largest_action,
+    random_behaviour,
+)
 from fdtasil.rollouts.environments import EnvironmentPool, resolve_horizon
 from fdtasil.rollouts.episodes import Episodes, check_episodes
 from fdtasil.rollouts.rollout import first_observations, rollout
@@ -193,7 +198,7 @@ def _batch_sizes(expert: Expert, states: np.ndarray) -> Finding:
         parts = {count: expert.ask(rows[:count], "check") for count in counts}
     except ExpertError as error:
         return Finding(name, error.found, error)
-    bound = _SAME * max(1.0, float(np.nan_to_num(np.abs(whole)).max()))
+    bound = _SAME * largest_action(whole)
     wrong = [n for n, part in parts.items() if farthest_apart(part, whole[:n]) > bound]
     if not wrong:
         return Finding(name, f"the same answers in batches of {_listed(counts)} rows", None)

@@ -31,7 +31,10 @@ GATE_QUERIES = 3 * GATE_STATES
 # Differences between two answers, as a share of the action range. Batches of another size change
 # the last bits of a float32 product; quantised and stochastic experts change the third digit.
 _SAME = 1e-4
-_LEAST = 0.1  # of an action's size, what counts as the range of one without bounds at least
+_LEAST = 0.1  # of an action's size, what counts as its range at least
+# Of the bounds' range too, times _SAME: a last layer that scales to them rounds by some digits of
+# float32 more.
+_SCALED = 0.01
 
 
 @dataclass(frozen=True)
@@ -152,7 +155,7 @@ def admit_expert(
 
 
 def compare_again(
-    expert: Expert, observations: np.ndarray, answers: np.ndarray, units: np.ndarray
+    expert: Expert, observations: np.ndarray, answers: np.ndarray, width: np.ndarray
 ) -> None:
     """Ask an expert again at the end of a run, and warn where it answers otherwise than before.
 
@@ -162,7 +165,7 @@ def compare_again(
         expert: The expert.
         observations: (N, n) states of the run.
         answers: (N, m) what it answered there.
-        units: (m,) what each action is measured in.
+        width: (m,) from each action's lower bound to its upper one.
     """
     chosen = np.linspace(0, len(observations) - 1, GATE_STATES).round().astype(int)
     before = answers[chosen]
@@ -175,7 +178,7 @@ def compare_again(
     if none.all():
         warn("asked again at the end of the run, the expert has no answer where it had one")
         return
-    apart = np.abs(now - before)[~none]
+    apart, units = np.abs(now - before)[~none], _ranges(answers, width)
     farther = apart.max(axis=0) / units
     if farther.max() <= _SAME:
         return
@@ -228,7 +231,7 @@ class _Answers:
     boxes: Boxes
 
     def same(self, other: np.ndarray, name: str, how: str, advice: tuple[str, str]) -> Finding:
-        difference, unit = farthest_apart(self.answers, other), self._ranges()
+        difference, unit = farthest_apart(self.answers, other), self._ranges
         measured = f"{how}: largest difference {difference:.1e}"
         if farthest_apart(self.answers / unit, other / unit) <= _SAME:
             return Finding(name, measured, None)
@@ -269,13 +272,14 @@ class _Answers:
     def _apart(self, ours: np.ndarray, theirs: np.ndarray) -> tuple[int, float]:
         """Return at how many rows answers differ, and by how much at most."""
         difference = np.nan_to_num(np.abs(ours - theirs), nan=0.0)
-        wrong = (difference > _SAME * self._ranges()).any(axis=1)
+        wrong = (difference > _SAME * self._ranges).any(axis=1)
         return int(wrong.sum()), float(difference.max())
 
     def within_bounds(self) -> Finding:
         low, high = self.boxes.low, self.boxes.high
         beyond = np.maximum(self.answers - high, low - self.answers)
-        outside = float((beyond > _SAME * self._ranges()).any(axis=1).mean())
+        width = np.where(np.isfinite(self._width), self._width, self._ranges)
+        outside = float((beyond > _SAME * width).any(axis=1).mean())
         measured = f"{100 * outside:.0f} % of the states have an action outside the bounds"
         if outside == 0:
             return Finding("action bounds", measured, None)
@@ -305,9 +309,26 @@ class _Answers:
             )
         return Finding("action scale", measured, None)
 
+    @property
+    def _width(self) -> np.ndarray:
+        return self.boxes.high.astype(np.float64) - self.boxes.low
+
+    @property
     def _ranges(self) -> np.ndarray:
-        """Return the range of each action, (m,), so that one in millimetres is no measure."""
-        width = self.boxes.high.astype(np.float64) - self.boxes.low
-        sizes = np.abs(self.answers).max(axis=0)
-        seen = np.maximum(np.ptp(self.answers, axis=0), _LEAST * sizes)
-        return np.where(np.isfinite(width), width, np.where(seen > 0, seen, 1.0))
+        return _ranges(self.answers, self._width)
+
+
+def _ranges(answers: np.ndarray, width: np.ndarray) -> np.ndarray:
+    """Return what differences of each action are measured in, (m,): how far it goes.
+
+    So that one in millimetres is no measure, nor bounds that are far beyond what is done.
+
+    Args:
+        answers: (B, m).
+        width: (m,) from each lower bound to the upper one.
+    """
+    sizes = np.abs(answers).max(axis=0)
+    seen = np.maximum(np.ptp(answers, axis=0), _LEAST * sizes).astype(np.float64)
+    bounded = np.isfinite(width)
+    seen = np.where(seen > 0, seen, np.where(bounded, width, 1.0))
+    return np.where(bounded, np.maximum(np.minimum(seen, width), _SCALED * width), seen)

@@ -36,7 +36,7 @@ from fdtasil.experts.trial import vouch_for
 from fdtasil.experts.workers import BATCH, Workers, check_workers, with_processes, with_threads
 from fdtasil.files.onnx.binding import Inputs, check_inputs
 from fdtasil.files.onnx.recurrent import check_memory
-from fdtasil.rollouts.behaviours import Policy
+from fdtasil.rollouts.behaviours import Policy, largest_action
 from fdtasil.rollouts.environments import EnvironmentPool
 
 __all__ = ["KINDS", "ExpertLike", "Kind", "expert_in", "load_expert", "open_expert", "sized"]
@@ -328,7 +328,9 @@ def _is_the_policy(module: torch.nn.Module, observation_size: int | None) -> boo
         return False
     if not isinstance(called, np.ndarray):  # PPO's says actions, values and log-probabilities
         return False
-    return called.shape == asked.shape and np.allclose(called, asked, atol=1e-5)
+    return called.shape == asked.shape and np.allclose(
+        called, asked, atol=1e-5 * largest_action(asked)
+    )
 
 
 def _from_predictor(source: Predictor, hints: Hints) -> Expert:

@@ -12,7 +12,7 @@ import numpy as np
 import torch
 
 from fdtasil.errors import ExpertError, first_line
-from fdtasil.rollouts.behaviours import Policy
+from fdtasil.rollouts.behaviours import Policy, largest_action
 
 __all__ = [
     "Memory",
@@ -53,9 +53,11 @@ def begins_elsewhere(memory: Memory, observations: np.ndarray) -> bool:
     if memory.begin is None:
         return False
     nothing = np.zeros((len(observations), memory.size), np.float32)
-    zeros, _ = memory.step(observations.copy(), nothing)
+    # A copy: who answers may write its next answer into the array of the last.
+    zeros = np.array(memory.step(observations.copy(), nothing)[0])
     begun = memory.begin(observations.copy())
-    return not np.allclose(begun, zeros, rtol=1e-3, atol=1e-4, equal_nan=True)
+    least = 1e-4 * largest_action(np.concatenate([zeros, begun]))
+    return not np.allclose(begun, zeros, rtol=1e-3, atol=least, equal_nan=True)
 
 
 def beginning_problem(memory: Memory, observations: np.ndarray, name: str) -> ExpertError | None:

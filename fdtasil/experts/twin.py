@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from fdtasil.files.onnx.nodes import free_inputs
+from fdtasil.rollouts.behaviours import largest_action
 
 if TYPE_CHECKING:
     import onnx
@@ -50,7 +51,7 @@ def torch_twin(
             answers = twin.compute(torch.from_numpy(rows), _LARGEST).numpy()
     except Exception:
         return None
-    tolerance = AGREEMENT * max(1.0, float(np.abs(expected).max()))
+    tolerance = AGREEMENT * largest_action(expected)
     agrees = answers.shape == expected.shape and np.abs(answers - expected).max() <= tolerance
     return twin if agrees else None
 

@@ -14,6 +14,7 @@ from fdtasil.experts.silence import MOST
 from fdtasil.experts.twin import AGREEMENT
 from fdtasil.probes.answers import Answers
 from fdtasil.probes.surroundings import Drawn, Surroundings
+from fdtasil.rollouts.behaviours import largest_action
 
 __all__ = ["DeviceTwin"]
 
@@ -113,6 +114,6 @@ class DeviceTwin:
             return float("inf")
         if found.shape != said.values.shape or np.isnan(found).mean() > MOST:
             return float("inf")
-        largest = max(1.0, float(np.abs(said.values).max()))
         # Where the expert had no answer, `said` has another one.
-        return float(np.nan_to_num(np.abs(found - said.values), nan=0.0).max()) / largest
+        apart = float(np.nan_to_num(np.abs(found - said.values), nan=0.0).max())
+        return apart / largest_action(said.values.reshape(-1, found.shape[-1]))

@@ -15,6 +15,7 @@ __all__ = [
     "follow",
     "follow_answers",
     "has_none",
+    "largest_action",
     "random_behaviour",
     "silent_rows",
 ]
@@ -73,6 +74,18 @@ def farthest_apart(ours: np.ndarray, theirs: np.ndarray) -> float:
     """Return the largest difference of (B, m) answers, where both are some; else 0."""
     both = ~(has_none(ours) | has_none(theirs))
     return float(np.abs(ours[both] - theirs[both]).max(initial=0.0))
+
+
+def largest_action(answers: np.ndarray) -> float:
+    """Return the size of the largest action among (B, m) answers; 1 where all are zero or none.
+
+    What two answers differ by is small or large beside it, whatever actions are measured in.
+
+    Example:
+        >>> largest_action(np.array([[1e-5, -3e-5]])), largest_action(np.zeros((2, 2)))
+        (3e-05, 1.0)
+    """
+    return float(np.abs(answers[~has_none(answers)]).max(initial=0.0)) or 1.0
 
 
 def random_behaviour(pool: EnvironmentPool) -> Behaviour:

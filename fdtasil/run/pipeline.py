@@ -4,6 +4,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from fdtasil.checks import check_flag, check_path
@@ -17,7 +18,6 @@ from fdtasil.experts.expert import Expert
 from fdtasil.experts.gate import GATE_STATES, compare_again
 from fdtasil.experts.load import ExpertLike
 from fdtasil.experts.silence import Silence
-from fdtasil.probes.scales import action_units
 from fdtasil.probes.source import Probes
 from fdtasil.probes.spread import SpreadLike
 from fdtasil.progress import Progress
@@ -411,5 +411,5 @@ def _ask_again(
         observations, actions = states.observations, states.actions
     else:
         return
-    units = action_units(recorded.low, recorded.high, actions)
-    compare_again(expert, observations, actions, units)
+    width = recorded.high.astype(np.float64) - recorded.low
+    compare_again(expert, observations, actions, width)
