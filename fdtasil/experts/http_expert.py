@@ -139,7 +139,7 @@ class _Client:
         end = time.monotonic() + self._timeout
         try:
             used = connection.sock is not None and self._is_quiet(connection)
-            with _Deadline(connection, end) as deadline:
+            with _Deadline(end) as deadline:
                 try:
                     response = self._request(connection, body, deadline)
                 except ConnectionError:
@@ -202,6 +202,7 @@ class _Client:
             connection.timeout = deadline.left()
             connection.connect()
         line: socket.socket = getattr(connection, "sock")  # noqa: B009 (for the type checker)
+        deadline.line = line  # the connection forgets it where the server will close it
         line.settimeout(deadline.left())
         connection.request("POST", self._target, body, headers)
         if hasattr(socket, "TCP_QUICKACK"):
@@ -310,10 +311,16 @@ class _Deadline:
     """The end of an exchange: at its time the connection is cut, whatever is waited for.
 
     A timeout of a socket begins anew with every byte that comes.
+
+    Attributes:
+        line: The socket that is cut; None until there is one.
+        over: Whether it was.
     """
 
-    def __init__(self, connection: http.client.HTTPConnection, end: float) -> None:
-        self._connection, self._end = connection, end
+    line: socket.socket | None
+
+    def __init__(self, end: float) -> None:
+        self._end, self.line = end, None
         self._clock = threading.Timer(max(end - time.monotonic(), 0), self._cut)
         self._clock.daemon = True
         self.over = False
@@ -344,10 +351,10 @@ class _Deadline:
             raise TimeoutError("the exchange did not end in time") from error
 
     def _cut(self) -> None:
-        self.over, socket_ = True, self._connection.sock
-        if socket_ is not None:
+        self.over = True
+        if self.line is not None:
             with suppress(OSError):
-                socket_.shutdown(socket.SHUT_RDWR)
+                self.line.shutdown(socket.SHUT_RDWR)
 
 
 def _line(text: str | bytes) -> str:
