@@ -4,7 +4,7 @@ import io
 import json
 import os
 from collections.abc import Mapping
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -25,7 +25,16 @@ from fdtasil.probes.spread import Spread
 from fdtasil.rollouts.history import past_size
 from fdtasil.rollouts.spaces import Spaces
 
-__all__ = ["Dataset", "DatasetLike", "check_dataset", "check_shapes", "load_dataset"]
+__all__ = [
+    "Dataset",
+    "DatasetLike",
+    "check_dataset",
+    "check_shapes",
+    "form_of",
+    "in_form",
+    "load_dataset",
+    "warn_of_bounds",
+]
 
 _VERSION = 2
 
@@ -106,13 +115,8 @@ class Dataset:
             "version": _VERSION,
             "environment": self.environment,
             "probes": self.probes.describe() if self.probes else "none",
+            **form_of(self),
         }
-        if self.spaces is not None:
-            about["spaces"] = self.spaces.to_json()
-        if self.history > 1 or self.remembered:
-            about |= {"history": self.history, "remembered": self.remembered}
-        if (spread := self.spread.to_json()) is not None:
-            about["spread"] = spread
         arrays["about"] = np.frombuffer(json.dumps(about).encode(), np.uint8)
         target = io.BytesIO()
         np.savez(target, **arrays)
@@ -131,6 +135,41 @@ class Dataset:
             StorageError: If it is not such a file, or of a later version.
         """
         return _read(arrays_from_bytes(data))
+
+
+def form_of(dataset: Dataset) -> dict[str, Any]:
+    """Return what the numbers of a dataset are, as JSON values, where it is not the usual."""
+    form: dict[str, Any] = {}
+    if dataset.spaces is not None:
+        form["spaces"] = dataset.spaces.to_json()
+    if dataset.history > 1 or dataset.remembered:
+        form |= {"history": dataset.history, "remembered": dataset.remembered}
+    if (spread := dataset.spread.to_json()) is not None:
+        form["spread"] = spread
+    return form
+
+
+def in_form(dataset: Dataset, form: Mapping[str, Any]) -> Dataset:
+    """Return a dataset whose numbers are what `form_of` said.
+
+    Raises:
+        KeyError, TypeError, ValueError: If they can't be, or it has not said that.
+    """
+    spaces = Spaces.from_json(form["spaces"]) if "spaces" in form else None
+    history, remembered = (
+        as_kind(int, form.get(name, usual), name)
+        for name, usual in (("history", 1), ("remembered", 0))
+    )
+    n, m = dataset.sizes
+    spread = Spread.from_json(form.get("spread"), n)
+    about = {"spaces": spaces, "history": history, "remembered": remembered, "spread": spread}
+    found = replace(dataset, **about)
+    good = history >= 1 and remembered >= 0 and found.own_size >= 1
+    if not good or n != found.own_size + past_size(history, found.own_size, m) + remembered:
+        raise ValueError(f"{n} observations with history {history} and memory {remembered}")
+    if spaces and spaces.actions.size != m:
+        raise ValueError("actions of another size than their space")
+    return found
 
 
 DatasetLike = Dataset | str | Path
@@ -331,21 +370,8 @@ def _read(arrays: Mapping[str, np.ndarray]) -> Dataset:
             raise ValueError("gains that are not positive numbers")
         answers = Answers(bank, numbers, values, gains)
     bounds = typed["low"], typed["high"]
-    spaces = Spaces.from_json(about["spaces"]) if "spaces" in about else None
-    history, remembered = (
-        as_kind(int, about.get(name, usual), name)
-        for name, usual in (("history", 1), ("remembered", 0))
-    )
-    spread = Spread.from_json(about.get("spread"), demonstrations.observations.shape[-1])
-    behind = spaces, history, remembered, spread
-    found = Dataset(demonstrations, _probes(spec, answers), answers, *bounds, environment, *behind)
-    n, m = found.sizes
-    good = history >= 1 and remembered >= 0 and found.own_size >= 1
-    if not good or n != found.own_size + past_size(history, found.own_size, m) + remembered:
-        raise ValueError(f"{n} observations with history {history} and memory {remembered}")
-    if spaces and spaces.actions.size != found.sizes[1]:
-        raise ValueError("actions of another size than their space")
-    return found
+    found = Dataset(demonstrations, _probes(spec, answers), answers, *bounds, environment)
+    return in_form(found, about)
 
 
 def _probes(spec: str, answers: Answers | None) -> Probes | None:

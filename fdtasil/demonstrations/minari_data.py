@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium
 import numpy as np
 
-from fdtasil.demonstrations.dataset import Dataset
+from fdtasil.demonstrations.dataset import Dataset, form_of, in_form
 from fdtasil.demonstrations.states import Demonstrations
 from fdtasil.errors import FdtasilError, SettingError, StorageError, first_line, shown
 from fdtasil.files.border import reads
@@ -27,6 +27,7 @@ __all__ = ["from_minari", "to_minari"]
 
 EXPERT_ACTION, DISPLACEMENTS, VALUES = "expert_action", "probe_displacements", "probe_values"
 """Keys of an exported dataset's infos."""
+_FORM = "fdtasil"  # key of its metadata: what the numbers of its rows are
 
 
 def from_minari(source: "str | minari.MinariDataset") -> Dataset:
@@ -61,11 +62,11 @@ def _dataset_of(source: "str | minari.MinariDataset", minari: Any) -> Dataset:
                 "one that `minari list local` shows",
                 f"minari download {source}",
             )
-        _check_files(folder / "data")
+        metadata = _checked(folder / "data")
         data = minari.load_dataset(source)
     else:
         data = source
-        _check_files(Path(data.storage.data_path))
+        metadata = _checked(Path(data.storage.data_path))
     spaces = _spaces_of(data)
     narrowing = Narrowing(spaces.observations.size, str(data.spec.dataset_id))
     episodes = [
@@ -79,8 +80,9 @@ def _dataset_of(source: "str | minari.MinariDataset", minari: Any) -> Dataset:
     ends = bounds_of(data.action_space, spaces.actions)
     low, high = (np.asarray(unbounded(bound), np.float32) for bound in ends)
     name = data.env_spec.id if data.env_spec else data.spec.dataset_id
-    kept = spaces.unless_plain
-    return Dataset(states, None, None, low, high, str(name), kept)
+    if _FORM in metadata:  # flat rows of ours, of any form
+        return in_form(Dataset(states, None, None, low, high, str(name)), metadata[_FORM])
+    return Dataset(states, None, None, low, high, str(name), spaces.unless_plain)
 
 
 def _spaces_of(data: "minari.MinariDataset") -> Spaces:
@@ -114,8 +116,8 @@ def _folder_of(dataset_id: str) -> Path:
 _METADATA, _METADATA_LIMIT = "metadata.json", 2**24
 
 
-def _check_files(folder: Path) -> None:
-    """Refuse a dataset that would have other files read, or modules imported.
+def _checked(folder: Path) -> dict[str, Any]:
+    """Return the metadata of a dataset; refuse what would read other files, or import modules.
 
     Raises:
         ValueError: If it would.
@@ -127,6 +129,7 @@ def _check_files(folder: Path) -> None:
         raise ValueError("its metadata do not say its spaces")
     for file in sorted(folder.glob("**/*.hdf5")):
         check_hdf5(file)
+    return metadata
 
 
 def to_minari(dataset: Dataset, dataset_id: str, **about: str) -> "minari.MinariDataset":
@@ -134,7 +137,9 @@ def to_minari(dataset: Dataset, dataset_id: str, **about: str) -> "minari.Minari
 
     An episode's actions are those that were taken; infos hold the expert's at every step
     ("expert_action") and, with probes, "probe_displacements" and "probe_values" as in `Answers`.
-    The state after the last step is not recorded, so the last observation stands twice.
+    The state after the last step is not recorded, so the last observation stands twice. All are
+    flat rows of numbers, scores of choices among them; "fdtasil" in the metadata says what they
+    are made of, and `from_minari` reads that.
 
     Args:
         dataset: What to write.
@@ -177,7 +182,7 @@ def to_minari(dataset: Dataset, dataset_id: str, **about: str) -> "minari.Minari
     parts = len(PurePosixPath(dataset_id).parts)
     made = [place for place in (folder, *folder.parents)[:parts] if not place.exists()]
     try:
-        return minari.create_dataset_from_buffers(
+        written = minari.create_dataset_from_buffers(
             dataset_id,
             buffers,
             observation_space=gymnasium.spaces.Box(-np.inf, np.inf, (n,), np.float32),
@@ -185,6 +190,9 @@ def to_minari(dataset: Dataset, dataset_id: str, **about: str) -> "minari.Minari
             requirements=[],
             **about,
         )
+        if form := form_of(dataset):
+            written.storage.update_metadata({_FORM: form})
+        return written
     except BaseException as error:
         if made:
             remove_folder(made[-1])

@@ -148,7 +148,7 @@ def _without_memory(expert: Expert) -> Expert:
 
 
 def bounded(given: Dataset, pool: EnvironmentPool) -> Dataset:
-    """Return a dataset with the environment's bounds of those actions that it has none of.
+    """Return a dataset with the environment's spaces, and its bounds of actions that have none.
 
     Scores of its choices are centred, as an expert's are: a student that learns from both would
     learn from two otherwise.
@@ -168,7 +168,8 @@ def bounded(given: Dataset, pool: EnvironmentPool) -> Dataset:
     if not (np.allclose(low, boxes.low) and np.allclose(high, boxes.high)):
         warn(f"{found}: the student stays within them; {theirs}")
     states = _centred(given.demonstrations, pool.spaces.actions)
-    whole = replace(given, low=low, high=high, demonstrations=states)
+    spaces = given.spaces or pool.spaces.unless_plain
+    whole = replace(given, low=low, high=high, demonstrations=states, spaces=spaces)
     if not (np.array_equal(low, given.low) and np.array_equal(high, given.high)):
         warn_of_bounds(whole)
     return whole
