@@ -324,6 +324,13 @@ FAULTS = {
         303: "a finished run with checkpoints that could not be dropped",
         304: "an export in eight bits, on a processor whose sums of them overflow",
         305: "the address of a file, in the place of a server's",
+        306: "a small file that is read in as much memory as the largest may take",
+        307: "bounds far beyond what is done, behind which an expert's noise is small",
+        308: "recorded scores beside an environment of choices",
+        309: "a memory's beginning, of answers in small units or in one buffer",
+        310: "a Minari dataset that does not say what its rows are",
+        311: "own derivatives beside a large number that stands still",
+        312: "derivatives of a module that are not finite",
     },
 }
 

@@ -307,6 +307,14 @@ def test_a_c_file_of_others_is_refused(tmp_path):
         fdtasil.load_expert(tmp_path / "other.c")
 
 
+@needs_a_compiler
+def test_a_c_file_that_can_not_be_compiled_is_refused_when_it_is_opened(quick, tmp_path):
+    path = quick.export(tmp_path / "student.c")
+    path.write_text(path.read_text() + "\nthis is no C;\n")
+    with pytest.raises(ExpertError, match="can't compile the C file"):
+        fdtasil.load_expert(path, trust="c")
+
+
 @pytest.mark.fault(211)
 @needs_a_compiler
 def test_threads_do_not_mix_the_buffers_of_compiled_code(quick, tmp_path):

@@ -8,10 +8,11 @@ import warnings
 from dataclasses import replace
 
 import numpy as np
+import onnx
 import pytest
 import torch
 from conftest import GAIN, QUICK, TOY, mlp_onnx
-from toy_forms import ACTIONS, OBSERVATIONS, in_form
+from toy_forms import ACTIONS, OBSERVATIONS, InForm, in_form
 
 import fdtasil
 from fdtasil import Fit, Mlp
@@ -600,3 +601,38 @@ def test_arrays_of_somebody_else_in_a_file(arrays, tmp_path):
     with pytest.raises(StorageError, match="did not write, with observations, actions") as caught:
         load_dataset(tmp_path / "mine.npz")
     assert "from_arrays" in caught.value.next_step
+
+
+@pytest.mark.fault(308)
+def test_recorded_scores_beside_an_environment_are_its_choices(tmp_path):
+    random = np.random.default_rng(0)
+    states = random.standard_normal((60, 4))
+    chosen = (states[:, 2] > 0).astype(int)
+    log = fdtasil.from_arrays(states, np.eye(2)[chosen] - 1 / 2)
+    run = {"probes": 0, "fit": Fit(steps=30), "evaluation_episodes": 0, "progress": False}
+    result = fdtasil.distill(None, "CartPole-v1", dataset=log, **run)
+    assert result.student.predict(states[0].astype(np.float32))[0] in (0, 1)
+    file = onnx.load(result.export(tmp_path / "s.onnx"))
+    assert [output.name for output in file.graph.output] == ["scores", "actions"]
+
+
+@pytest.mark.fault(310)
+@pytest.mark.parametrize("history", [1, 3])
+def test_a_minari_dataset_says_what_its_rows_are(history, tmp_path, monkeypatch):
+    pytest.importorskip("minari")
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    expert = in_form(lambda x: np.asarray(x, np.float32) @ GAIN.T, "nested", "choice")
+    made = lambda: InForm("nested", "choice")  # noqa: E731
+    run = {"episodes": 2, "horizon": 9, "evaluation_episodes": 0, "fit": Fit(steps=3)}
+    wrote = fdtasil.distill(expert, made, 0, history=history, progress=False, **run).dataset
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)  # of Minari, of what it is not told
+        kept = fdtasil.to_minari(wrote, "toy/choices-v0")
+    read = fdtasil.from_minari("toy/choices-v0")
+    assert (read.spaces, read.history, read.own_size) == (wrote.spaces, history, wrote.own_size)
+    assert np.array_equal(read.demonstrations.observations, wrote.demonstrations.observations)
+    spoilt = json.loads((kept.storage.data_path / "metadata.json").read_text())
+    spoilt["fdtasil"] = {"history": 7}
+    (kept.storage.data_path / "metadata.json").write_text(json.dumps(spoilt))
+    with pytest.raises(StorageError, match="history 7"):
+        fdtasil.from_minari("toy/choices-v0")

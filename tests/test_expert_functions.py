@@ -504,3 +504,32 @@ def test_an_output_that_is_a_list_of_dictionaries_says_how_to_convert_it(tmp_pat
         with pytest.raises(ExpertError) as caught:
             fdtasil.load_expert(tmp_path / "classifier.onnx", 3, output=output)
         assert '{"zipmap": False}' in caught.value.next_step
+
+
+@pytest.mark.parametrize(
+    ("option", "said"),
+    [({"inputs": {"obs": "0:5"}}, "inputs="), ({"memory": {"h": "g"}}, "memory=")],
+)
+@pytest.mark.parametrize("source", ["http://127.0.0.1:9/act", "agent.zip", lambda rows: rows])
+def test_an_option_that_nothing_is_made_of_is_refused(source, option, said):
+    with pytest.raises(SettingError, match=said):
+        fdtasil.load_expert(source, 5, 2, **option)
+
+
+def test_a_trust_that_nothing_was_opened_with_is_not_recorded(tmp_path):
+    assert fdtasil.load_expert(mlp_onnx(tmp_path / "e.onnx"), trust="pickle").opened is None
+    assert fdtasil.load_expert(mlp_onnx(tmp_path / "e.onnx"), output="actions").opened
+
+
+def test_a_predict_that_is_no_function():
+    class Odd:
+        predict = 3
+
+    with pytest.raises(ExpertError, match=r"Odd\.predict is a int"):
+        fdtasil.load_expert(Odd(), 5, 2)
+
+
+def test_answers_of_several_widths_are_told():
+    expert = fdtasil.load_expert(lambda rows: np.ones((len(rows), 1 + len(rows))), batch=4)
+    with pytest.raises(ExpertError, match="some batches with 3 actions, others with 5"):
+        expert.ask(np.zeros((6, 3)), "check")

@@ -110,6 +110,25 @@ def test_an_action_in_large_numbers_does_not_hide_the_noise_of_another(unit):
         admit_expert(load_expert(noisy), rows, boxes)
 
 
+@pytest.mark.fault(307)
+@pytest.mark.parametrize("bound", [3.0, 1e4])
+def test_bounds_far_beyond_what_is_done_hide_neither_noise_nor_a_batch(bound):
+    boxes = Boxes(5, np.full(2, -bound, np.float32), np.full(2, bound, np.float32))
+    rows = np.random.default_rng(0).uniform(-0.5, 0.5, (16, 5)).astype(np.float32)
+    random = np.random.default_rng(1)
+    noisy = lambda x: x[:, :2] + 0.3 * random.standard_normal((len(x), 2))  # noqa: E731
+    mean = lambda x: x[:, :2] + x.mean()  # noqa: E731
+    for expert, what in ((noisy, "asked twice"), (mean, "asked alone")):
+        with pytest.raises(ExpertError, match=what):
+            admit_expert(load_expert(expert), rows, boxes)
+    # A last layer that scales to the bounds rounds by more than the actions' own digits.
+    first, last = (
+        random.standard_normal(shape).astype(np.float32) for shape in ((5, 64), (64, 2))
+    )
+    law = lambda x: bound * np.tanh(np.tanh(x @ first) @ last / bound)  # noqa: E731
+    admit_expert(load_expert(law), rows, boxes, largest=1024)
+
+
 @pytest.mark.fault(281)
 def test_chance_that_few_rows_did_not_show_is_not_taken_for_the_size_of_a_batch():
     """With `batch=16` as advice, the check that found it would be gone."""

@@ -125,6 +125,14 @@ def test_every_revision_is_pinned(revision, large, hub, tmp_path, rows):
     assert not any("code.py" in path for path in hub.asked())
 
 
+def test_an_output_of_a_file_of_the_hub_is_chosen(hub, tmp_path, rows):
+    several = mlp_onnx(tmp_path / "several.onnx", extra_outputs={"value": 2})
+    hub.repositories["org/repo"].commit({"walker.onnx": several.read_bytes()})
+    chosen = load_expert(WALKER, 5, 2, output="value").ask(rows, "check")
+    local = load_expert(several, 5, 2, output="value").ask(rows, "check")
+    assert np.array_equal(chosen, local)
+
+
 def test_a_branch_that_moves_is_followed_and_a_commit_is_not(hub, tmp_path, rows):
     before = load_expert(WALKER)
     other = mlp_onnx(tmp_path / "other.onnx", scale=2.0).read_bytes()

@@ -379,3 +379,24 @@ def test_a_memory_may_be_a_dictionary():
     second, _ = expert.memory.step(rows, kept)
     assert first == pytest.approx(rows @ GAIN.T, abs=1e-5)
     assert second == pytest.approx(0.5 * first + 0.9 * rows @ GAIN.T, abs=1e-5)
+
+
+@pytest.mark.fault(309)
+@pytest.mark.parametrize("unit", [1.0, 1e-5])
+@pytest.mark.parametrize("keeps", [False, True])
+def test_a_beginning_is_seen_in_any_unit_and_behind_one_buffer(unit, keeps):
+    class FromOne:
+        def __init__(self):
+            self.buffer = np.zeros((64, 2))
+
+        def predict(self, observation, state=None, episode_start=None, deterministic=False):
+            last = np.zeros((len(observation), 1)) if state is None else state
+            last = np.where(np.reshape(episode_start, (-1, 1)), 1.0, last)
+            answers = unit * np.repeat(last, 2, axis=1)
+            if keeps:
+                self.buffer[: len(answers)] = answers
+                answers = self.buffer[: len(answers)]
+            return answers, last / 2
+
+    with pytest.raises(ExpertError, match="another memory than zeros"):
+        load_expert(FromOne(), N, 2)

@@ -291,3 +291,56 @@ def test_an_expert_that_refuses_most_of_what_lies_outside_is_told_why_before_tra
     assert "moved states" in error.value.found
     assert "smaller radius" in error.value.next_step
     assert len(str(error.value).splitlines()) <= 6
+
+
+class Derives:
+    """x -> GAIN x with its own derivatives, counting the rows of each call."""
+
+    def __init__(self):
+        self.rows = []
+
+    def __call__(self, observations):
+        return np.asarray(observations, np.float64)[:, :5] @ GAIN.T.astype(np.float64)
+
+    def jacobian(self, observations):
+        self.rows.append(len(observations))
+        given = np.zeros((len(observations), *GAIN.shape[:1], observations.shape[1]))
+        given[:, :, :5] = GAIN
+        return given
+
+
+def test_own_derivatives_are_asked_as_many_at_once_as_actions(tmp_path):
+    expert = Derives()
+    states = np.random.default_rng(0).standard_normal((9, 5))
+    log = fdtasil.from_arrays(states, expert(states))
+    one = load_expert(expert, 5, 2, batch=1)
+    fdtasil.distill(one, None, "jacobian", dataset=log, fit=fdtasil.Fit(steps=3))
+    assert set(expert.rows) == {1}
+
+
+@pytest.mark.fault(311)
+def test_a_large_number_that_stands_still_is_no_fault_of_own_derivatives():
+    expert = Derives()
+    states = np.random.default_rng(0).standard_normal((40, 6))
+    states[:, 5] = 300_000
+    log = fdtasil.from_arrays(states, expert(states))
+    result = fdtasil.distill(expert, None, "jacobian", dataset=log, fit=fdtasil.Fit(steps=3))
+    assert result.queries["probe"] > 40
+
+
+@pytest.mark.fault(312)
+def test_derivatives_of_a_module_that_are_not_finite_are_named():
+    class Root(torch.nn.Module):
+        def forward(self, x):
+            return torch.sqrt(torch.relu(x[:, :2]))
+
+    states = np.random.default_rng(0).standard_normal((20, 5)).astype(np.float32)
+    log = fdtasil.from_arrays(states, Root()(torch.as_tensor(states)).numpy())
+    with pytest.raises(ExpertError, match=r"derivatives that are not finite at \d+ of 20 states"):
+        fdtasil.distill(Root(), None, "jacobian", dataset=log, fit=fdtasil.Fit(steps=3))
+
+
+def test_a_basis_is_asked_once_where_nothing_of_it_is_drawn():
+    assert Probes.parse("basis,resample") == Probes.parse("basis")
+    assert Probes.parse("basis,resample,radius=0.1..1").resample
+    assert not Probes.parse("basis,resample,radius=0.1").resample

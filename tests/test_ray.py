@@ -124,3 +124,34 @@ def test_an_actor_that_was_ended_is_not_begun_again():
         with pytest.raises(CancelledError):
             answer.result(10)
     assert said == ["begun", "asked", "ended"]
+
+
+def test_an_expert_that_can_not_be_opened_there_is_told_so():
+    """With a stand-in for ray: its actor fails when it is made."""
+
+    class Failed(Exception):
+        actor_init_failed = True
+
+    class Ray:
+        exceptions = types.SimpleNamespace(
+            GetTimeoutError=TimeoutError, RayTaskError=ZeroDivisionError, RayError=Failed
+        )
+
+        def remote(self, **_):
+            method = types.SimpleNamespace(remote=lambda *_: "reply")
+            return lambda _: types.SimpleNamespace(
+                remote=lambda _: types.SimpleNamespace(opened=method, answer=method)
+            )
+
+        def wait(self, opened, timeout):
+            return opened, []
+
+        def get(self, *_, **__):
+            raise Failed("The actor died\nModuleNotFoundError: No module named 'planner'")
+
+        def is_initialized(self):
+            return False
+
+    actor = on_ray._Actor(Ray(), "the expert on Ray", b"", None)
+    with pytest.raises(ExpertError, match="can't open it: ModuleNotFoundError"):
+        actor.answer(ROWS)

@@ -3,6 +3,7 @@
 import errno
 import os
 import pickle
+import tracemalloc
 
 import numpy as np
 import pytest
@@ -12,6 +13,7 @@ import fdtasil
 from fdtasil import errors
 from fdtasil.demonstrations.dataset import Dataset
 from fdtasil.errors import SettingError, StorageError
+from fdtasil.files.reading import read_plain
 from fdtasil.files.storage import sha256, to_json, verify, write_bytes, write_folder
 from fdtasil.seeding import episode_seeds, generator, torch_generator
 
@@ -136,3 +138,16 @@ def test_a_file_that_was_changed_is_not_removed(tmp_path):
     (tmp_path / "b").write_text("the user's own by now")
     write_folder(tmp_path, {"a": b"3"})
     assert (tmp_path / "b").exists()
+
+
+@pytest.mark.fault(306)
+def test_a_small_file_is_read_in_little_memory(tmp_path):
+    """Not in as much as the largest may have, which many computers refuse."""
+    (tmp_path / "small").write_bytes(b"x" * 100)
+    tracemalloc.start()
+    try:
+        assert len(read_plain(tmp_path / "small")) == 100
+        _, peak = tracemalloc.get_traced_memory()
+    finally:
+        tracemalloc.stop()
+    assert peak < 2**20

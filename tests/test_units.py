@@ -4,9 +4,11 @@ from dataclasses import replace
 
 import gymnasium
 import numpy as np
+import onnx
 import pytest
 import torch
 from conftest import GAIN, QUICK, TOY
+from onnx import TensorProto, helper, numpy_helper
 from toy_environments import Integrator
 from toy_tasks import linear_task, stream
 
@@ -289,3 +291,23 @@ def test_a_change_of_an_action_in_small_numbers_is_found_at_the_end(unit):
 
     with pytest.warns(FdtasilWarning, match="has changed during the run.*altogether other"):
         fdtasil.distill(law, scaled_actions(unit), 1, callback=change, **QUICK)
+
+
+@pytest.mark.fault(200)
+@pytest.mark.parametrize("unit", [1.0, 1e-5])
+def test_a_graph_that_jumps_has_no_twin_in_any_unit(unit, tmp_path):
+    """A twin computes in float32 throughout, so its numbers are no whole ones."""
+    nodes = [
+        helper.make_node("Cast", ["obs"], ["whole"], to=TensorProto.INT32),
+        helper.make_node("Cast", ["whole"], ["back"], to=TensorProto.FLOAT),
+        helper.make_node("Mul", ["back", "unit"], ["actions"]),
+    ]
+    ends = [
+        helper.make_tensor_value_info(name, TensorProto.FLOAT, ["batch", 3])
+        for name in ("obs", "actions")
+    ]
+    weights = [numpy_helper.from_array(np.float32(unit), "unit")]
+    graph = helper.make_graph(nodes, "jumps", ends[:1], ends[1:], weights)
+    opset = [helper.make_opsetid("", 18)]
+    onnx.save(helper.make_model(graph, opset_imports=opset, ir_version=8), tmp_path / "j.onnx")
+    assert fdtasil.load_expert(tmp_path / "j.onnx", 3, 3).module is None

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fdtasil.errors import ExpertError
+from fdtasil.errors import ExpertError, ExportError
 from fdtasil.experts.expert import Expert, Hints
 from fdtasil.files.compiled import shared_function
 from fdtasil.files.reading import read_limited
@@ -23,7 +23,8 @@ def open_c(source: str | Path, hints: Hints) -> Expert:
     """Compile a C file and ask its function.
 
     Raises:
-        ExpertError: If the caller does not allow it, or it is no file of fdtasil's.
+        ExpertError: If the caller does not allow it, it is no file of fdtasil's, or it can't be
+            compiled.
     """
     if hints.trust != "c":
         raise ExpertError(
@@ -41,6 +42,10 @@ def open_c(source: str | Path, hints: Hints) -> Expert:
         )
     n, m = sizes["OBSERVATIONS"], sizes["ACTIONS"]
     policy = _Compiled(text, n, m)
+    try:
+        policy.compile()
+    except ExportError as error:
+        raise ExpertError(f"{source}: {error.found}", error.expected, error.next_step) from error
     digest = sha256(text.encode())
     return Expert(policy, Path(source).name, n, m, digest, source=str(source))
 
@@ -63,6 +68,10 @@ class _Compiled:
     @cached_property
     def _function(self) -> Callable[[int, int], None]:
         return shared_function(self._arguments[0], "student")
+
+    def compile(self) -> None:
+        """Compile it now; a copy in another process does when it is asked."""
+        _ = self._function
 
     def __call__(self, observations: np.ndarray) -> np.ndarray:
         actions = np.empty((len(observations), self._arguments[2]), np.float32)

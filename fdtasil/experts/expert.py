@@ -158,7 +158,7 @@ class Expert:
             parts = self.workers.each(self._ask_chunk, chunks)
         else:
             parts = [self._ask_chunk(chunk, self.answer) for chunk in chunks]
-        answers = np.concatenate(_equally_wide(parts))
+        answers = np.concatenate(_equally_wide(parts, self.name))
         none = has_none(answers)
         if none.any():
             answers[none] = np.nan
@@ -346,15 +346,26 @@ _EACH = ", one of a single state by lambda rows: np.stack([np.ravel(f(row)) for 
 _NOT_OF_A_ROW = {"MemoryError", "TimeoutError", "RecursionError"}
 
 
-def _equally_wide(parts: Sequence[np.ndarray]) -> list[np.ndarray]:
-    """Return answers of one width: where all rows of a batch had none, it was not known."""
+def _equally_wide(parts: Sequence[np.ndarray], name: str) -> list[np.ndarray]:
+    """Return answers of one width: where all rows of a batch had none, it was not known.
+
+    Raises:
+        ExpertError: If there are several.
+    """
     width = max(part.shape[1] for part in parts)
-    return [
+    wide = [
         np.repeat(part, width, axis=1)
         if part.shape[1] == 1 < width and np.isnan(part).all()
         else part
         for part in parts
     ]
+    if len(widths := {part.shape[1] for part in wide}) > 1:
+        raise ExpertError(
+            f"{name} answered some batches with {min(widths)} actions, others with {width}",
+            "as many for each",
+            "return one row of actions for each row of observations",
+        )
+    return wide
 
 
 def _not_finite(expert: Expert, rows: int, bad: np.ndarray) -> ExpertError:

@@ -129,19 +129,6 @@ def load_expert(
     bound = None if inputs is None else check_inputs(inputs)
     kind = _kind_of(source)
     pairs = None if memory is None else check_memory(memory)
-    named = bound is not None or pairs is not None
-    if named and not isinstance(source, str | Path):
-        raise SettingError(
-            f"{'memory' if bound is None else 'inputs'}= of a {type(source).__name__}",
-            "the path of an ONNX file, whose inputs have names",
-            "leave it out",
-        )
-    if output is not None and kind.opens not in _WITH_OUTPUTS:
-        raise SettingError(
-            f"output={output!r} of a {type(source).__name__}, whose answer has no parts",
-            "an ONNX file, a torch module or a function that returns several things",
-            "leave it out",
-        )
     hints = Hints(observation_size, action_size, output, trust, timeout, bound, pairs)
     workers, timeout = check_workers(workers, threads, timeout, kind.remote)
     expert = sized(open_expert(source, hints), observation_size, action_size)
@@ -194,11 +181,27 @@ def open_expert(source: ExpertLike, hints: Hints) -> Expert:
     """Open an expert whose sizes may be others than those hinted at; see `load_expert`."""
     if isinstance(source, str | Path):
         check_path("expert", source)
+    kind = _kind_of(source)
+    told = {name: getattr(hints, name) for name in (*_TAKEN_BY, "trust")}
+    told = {name: value for name, value in told.items() if value is not None}
+    for name in told.keys() & _TAKEN_BY.keys() - kind.takes:
+        raise SettingError(
+            f"{name}={told[name]!r} of {kind.called or f'a {type(source).__name__}'}",
+            _TAKEN_BY[name],
+            "leave it out",
+        )
     with usual_modes():
-        found = _kind_of(source).opens(source, hints)
-    told = {name: getattr(hints, name) for name in ("output", "inputs", "memory", "trust")}
-    said = [f"{name}={value!r}" for name, value in told.items() if value is not None]
+        found = kind.opens(source, hints)
+    said = [f"{name}={value!r}" for name, value in told.items() if name in kind.takes]
     return dataclasses.replace(found, opened=in_one_line(", ".join(said))) if said else found
+
+
+_TAKEN_BY = {
+    "output": "an ONNX file, a torch module or a function that returns several things",
+    "inputs": "an ONNX file, whose inputs have names",
+    "memory": "an ONNX file, whose inputs have names",
+}
+"""Who takes an option, by its name; `trust` may be said of anybody."""
 
 
 def sized(expert: Expert, observation_size: int | None, action_size: int | None) -> Expert:
@@ -369,25 +372,30 @@ class Kind:
     Attributes:
         recognises: Whether a source is of this kind.
         opens: A source of this kind, and what is known of it -> the expert.
+        takes: The options of `load_expert` that say how.
+        called: What it is; None for what its class is called.
         remote: Whether somebody else answers, is waited for, and keeps the time.
     """
 
     recognises: Callable[[object], bool]
     opens: Callable[[Any, Hints], Expert]
+    takes: frozenset[str] = frozenset()
+    called: str | None = None
     remote: bool = False
 
 
+_PARTS, _TRUST = frozenset({"output"}), frozenset({"trust"})
+_INPUTS = _PARTS | {"inputs", "memory"}
+
 KINDS = (
     Kind(lambda source: isinstance(source, Expert), _from_expert),
-    Kind(is_http_url, _from_http, remote=True),
-    Kind(is_hub_uri, _from_hub),
-    Kind(_is_zip, _from_agent),
-    Kind(_is_c, open_c),
-    Kind(_is_path, open_onnx),
-    Kind(lambda source: isinstance(source, torch.nn.Module), _from_torch),
+    Kind(is_http_url, _from_http, called="a server", remote=True),
+    Kind(is_hub_uri, _from_hub, _INPUTS | _TRUST, "a file of the hub"),
+    Kind(_is_zip, _from_agent, _TRUST, "an agent's zip"),
+    Kind(_is_c, open_c, _TRUST, "a C file"),
+    Kind(_is_path, open_onnx, _INPUTS, "an ONNX file"),
+    Kind(lambda source: isinstance(source, torch.nn.Module), _from_torch, _PARTS),
     Kind(lambda source: isinstance(source, Predictor), _from_predictor),
-    Kind(callable, _from_function),
+    Kind(callable, _from_function, _PARTS),
 )
 """Every kind of expert; the first that recognises a source opens it."""
-
-_WITH_OUTPUTS = (open_onnx, _from_torch, _from_function)

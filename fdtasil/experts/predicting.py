@@ -1,7 +1,7 @@
 """Objects with a `predict`, such as stable-baselines3's agents, with what stands beside them."""
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -33,11 +33,12 @@ def open_predictor(
         chooses: Whether its actions are choices; an agent's scores are asked for in their place.
 
     Raises:
-        ExpertError: If it was trained on observations that another wrapper made.
+        ExpertError: If it was trained on observations that another wrapper made, or its `predict`
+            is no function.
     """
     name = f"{type(source).__name__}.predict"
     # scikit-learn's predict takes the batch alone; stable-baselines3's is stochastic by default.
-    parameters = inspect.signature(source.predict).parameters
+    parameters = _parameters_of(source.predict, name)
     options = {"deterministic": True} if "deterministic" in parameters else {}
     asked, statistics = _asked(source), normaliser_of(source)
     if "state" in parameters and observation_size is not None:
@@ -48,6 +49,21 @@ def open_predictor(
     scores = scores_of(getattr(source, "policy", source)) if chooses else None
     answer = _Predicts(asked, name, options, statistics, scores)
     return Expert(answer, name, jacobian=own_jacobian(source))
+
+
+def _parameters_of(predict: Any, name: str) -> Collection[str]:
+    """Return the names of what a function takes; none of one of a compiled module that hides them.
+
+    Raises:
+        ExpertError: If it is no function.
+    """
+    if not callable(predict):
+        found = f"{name} is a {type(predict).__name__}"
+        raise ExpertError(found, "a function of observations", "pass a function of a batch")
+    try:
+        return inspect.signature(predict).parameters
+    except (TypeError, ValueError):
+        return ()
 
 
 @dataclass(frozen=True)

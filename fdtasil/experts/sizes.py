@@ -9,7 +9,7 @@ _VERSIONS = {
     frozenset({105, 111}): "Ant-v3 gives 111, Ant-v5 105",
     frozenset({348, 376}): "Humanoid-v4 gives 376, Humanoid-v5 348",
     frozenset({9, 11}): "InvertedDoublePendulum-v4 gives 11, InvertedDoublePendulum-v5 9",
-    frozenset({10, 11}): "Pusher and Reacher differ so between v4 and v5",
+    frozenset({10, 11}): "Reacher-v4 gives 11, Reacher-v5 10",
 }
 _STACKS = range(2, 17)
 

@@ -8,11 +8,11 @@ import torch
 from fdtasil.errors import ExpertError, in_one_line
 from fdtasil.experts.expert import Expert
 from fdtasil.probes.gains import gain_rows, gains
-from fdtasil.probes.scales import measure_scales
+from fdtasil.probes.scales import ROUNDING, measure_scales
 
 __all__ = ["check_derivatives", "comparison_rows", "differentiate"]
 
-_STATES = 64  # differentiated at once
+_STATES, _NUMBERS = 64, 2**24  # differentiated at once: states, and numbers of their directions
 _COMPARED = 4  # states at which an expert's own derivatives are compared with differences
 _PROBED = 'probe it instead: probes="basis" or probes=10'
 _APART = 3  # errors of a difference that they may lie apart, and
@@ -43,11 +43,20 @@ def differentiate(
             of its actions.
     """
     along = _of_module(expert.module, order) if expert.module else _of_the_expert(expert, order)
-    parts = []
-    for start in range(0, len(observations), _STATES):
-        rows = slice(start, start + _STATES)
+    parts, size = [], numbers.shape[1] * observations.shape[1]
+    block = max(1, min(_STATES, _NUMBERS // size))
+    for start in range(0, len(observations), block):
+        rows = slice(start, start + block)
         parts.append(along(observations[rows], directions[numbers[rows]]))
-    return np.concatenate(parts)
+    found = np.concatenate(parts)
+    if not np.isfinite(found).all():
+        bad = int((~np.isfinite(found)).any(axis=(1, 2, 3)).sum())
+        raise ExpertError(
+            f"{expert.name} has derivatives that are not finite at {bad} of {len(found)} states",
+            "finite derivatives",
+            f"look at the law there, such as the root of 0; or {_PROBED}",
+        )
+    return found
 
 
 Along = Callable[[np.ndarray, np.ndarray], np.ndarray]
@@ -108,7 +117,13 @@ def _of_the_expert(expert: Expert, order: int) -> Along:
 
 
 def _jacobians(expert: Expert, rows: np.ndarray) -> np.ndarray:
-    """Ask for the derivatives at some states, counted as rows of probes."""
+    """Ask for the derivatives at some states, as many at once as actions are asked."""
+    starts = range(0, len(rows), expert.chunk)
+    return np.concatenate([_asked(expert, rows[start : start + expert.chunk]) for start in starts])
+
+
+def _asked(expert: Expert, rows: np.ndarray) -> np.ndarray:
+    """Ask for the derivatives at some states in one call, counted as rows of probes."""
     assert expert.jacobian is not None
     expert.count(len(rows), "probe")
     expected = f"({len(rows)}, {expert.action_size or 'm'}, {rows.shape[1]}) finite derivatives"
@@ -149,7 +164,8 @@ def check_derivatives(expert: Expert, observations: np.ndarray) -> None:
         return
     chosen = np.linspace(0, len(observations) - 1, _COMPARED).astype(int)
     rows = observations[chosen]
-    scale = measure_scales(observations).units
+    least = ROUNDING * np.abs(rows).max(axis=0)  # smaller steps are rounded away
+    scale = np.maximum(measure_scales(observations).units, least)
     given, found = _jacobians(expert, rows), gains(expert, rows, scale=scale)
     expert.count(found.queries, "probe")
     apart = np.sqrt(np.nanmean(((given - found.jacobian) * scale) ** 2, axis=0))

@@ -28,6 +28,7 @@ __all__ = [
 _FEW = 5  # demonstrations, of which each counts
 _USUALLY = 0.75  # share of the expert's episodes that it survives
 _MISFIT = 0.15  # share of the actions' deviation; students of the experts here reach 0.01
+_RAISED = "; each row of a batch that raises is asked again, alone: a row of NaN costs no query"
 _SHOWN = 8  # coordinates named in a warning
 _CLEARLY = 4  # of float32's steps, that rounding does not move a coordinate by
 _SMALL = 1e-4  # of the median deviation; robots' observations differ by less
@@ -92,7 +93,7 @@ def warn_of_silence(shares: Mapping[str, float], reason: str, given_up: int) -> 
     ended = f"; {given_up} episode{'s' * (given_up > 1)} ended for it" if given_up else ""
     warn(
         f"the expert had no answer to some rows (shares: {where}), which are left out{ended}; the "
-        f"last time it said {reason}"
+        f"last time it said {reason}" + ("" if reason == "NaN" else _RAISED)
     )
 
 

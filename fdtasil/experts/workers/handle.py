@@ -224,4 +224,5 @@ def _kill(process: "subprocess.Popen[bytes]") -> None:
 def _ending(code: int) -> str:
     if code >= 0:
         return f"ended with exit code {code}"
-    return f"was killed by {signal.Signals(-code).name}"
+    known = {one.value: one.name for one in signal.Signals}  # not those of real time
+    return f"was killed by {known.get(-code, f'signal {-code}')}"

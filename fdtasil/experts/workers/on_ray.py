@@ -100,6 +100,12 @@ class _Actor:
                 self._end()
                 if self._stopped:  # it was ended, and not lost
                     raise CancelledError from error
+                if getattr(error, "actor_init_failed", False):
+                    raise ExpertError(
+                        f"{self._title} can't open it: {str(error).strip().splitlines()[-1]}",
+                        "an expert that opens there as it does here",
+                        "install there what it imports, and let it need no file of this machine",
+                    ) from error
                 if not left:
                     raise ExpertError(
                         f"{self._title} was lost {_TRIES} times with a batch of {len(rows)}: "
