@@ -452,3 +452,31 @@ def test_trust_reaches_the_policy_that_asks_for_it(quick, inside, tmp_path):
         assert "--trust c" in inside(*line).stderr
         done = inside(*line, "--trust", "c")
         assert done.returncode == 0, done.stderr
+
+
+def test_json_is_printed_in_the_place_of_the_text(inside, tmp_path):
+    expert = mlp_onnx(tmp_path / "e.onnx")
+    line = ("evaluate", expert, TOY, "--expert", expert, "--episodes", 2, "--horizon", 5)
+    done = inside(*line, "--json", "-")
+    assert json.loads(done.stdout)["normalized_return"] == 1.0
+    assert done.returncode == 0
+
+
+@pytest.mark.parametrize("flag", ["--student-obs", "--log-formats"])
+def test_flags_that_have_swallowed_the_arguments_are_named(flag, inside, tmp_path):
+    expert = mlp_onnx(tmp_path / "e.onnx")
+    for line in ([flag, "0", expert, TOY], [flag, "0", expert, TOY, "--episodes", 1]):
+        done = inside("distill", *line, cwd=tmp_path)
+        assert done.returncode == 2
+        assert f"{flag} 0" in done.stderr
+        assert "before flags of several values" in done.stderr
+
+
+def test_two_folders_and_swapped_arguments(inside, tmp_path):
+    expert = mlp_onnx(tmp_path / "e.onnx")
+    done = inside("distill", expert, TOY, "--resume", "a", "--out", "b", cwd=tmp_path)
+    assert done.returncode == 2
+    assert "--out beside --resume a" in done.stderr
+    done = inside("distill", TOY, expert, cwd=tmp_path)
+    assert done.returncode == 1
+    assert "in the place of the environment" in done.stderr

@@ -636,3 +636,40 @@ def test_a_minari_dataset_says_what_its_rows_are(history, tmp_path, monkeypatch)
     (kept.storage.data_path / "metadata.json").write_text(json.dumps(spoilt))
     with pytest.raises(StorageError, match="history 7"):
         fdtasil.from_minari("toy/choices-v0")
+
+
+@pytest.mark.fault(315)
+def test_a_setpoint_of_a_log_is_warned_of_without_an_evaluation(linear):
+    states = np.random.default_rng(0).standard_normal((80, 5))
+    states[:, 3] = np.repeat([0.1, 0.4, -0.2, 0.6], 20)
+    log = fdtasil.from_arrays(states, linear(states), episode_ends=[20, 40, 60, 80])
+    with pytest.warns(FdtasilWarning, match=r"stand still within an episode.*spread=\{3: 0\.3"):
+        fdtasil.distill(linear, None, 3, dataset=log, fit=Fit(steps=3), progress=False)
+
+
+@pytest.mark.fault(316)
+def test_modes_and_flags_of_a_log_are_warned_of_where_they_are_probed(linear):
+    random = np.random.default_rng(0)
+    states = random.standard_normal((80, 5))
+    states[:, 2], states[:, 4] = random.integers(0, 3, 80), random.integers(0, 2, 80)
+    log = fdtasil.from_arrays(states, linear(states))
+    run = {"dataset": log, "fit": Fit(steps=3), "progress": False}
+    with pytest.warns(FdtasilWarning, match=r"whole numbers in every state \(2, 4\)"):
+        fdtasil.distill(linear, None, 3, **run)
+    fdtasil.distill(linear, None, 3, student_obs=[0, 1, 3], **run)
+    fdtasil.distill(None, None, 0, **run)
+    states[:, 2], states[:, 4] = np.arange(80), random.standard_normal(80)  # steps of a motor
+    counted = fdtasil.from_arrays(states, linear(states))
+    fdtasil.distill(linear, None, 3, **{**run, "dataset": counted})
+
+
+def test_a_log_beside_an_environment_of_parts_takes_its_form(tmp_path):
+    expert = in_form(lambda x: np.asarray(x, np.float32) @ GAIN.T, "dictionary")
+    made = lambda: InForm("dictionary")  # noqa: E731
+    run = {"fit": Fit(steps=3), "evaluation_episodes": 2, "horizon": 9, "progress": False}
+    recorded = fdtasil.distill(expert, made, 0, episodes=1, **run).demonstrations
+    log = fdtasil.from_arrays(recorded.observations, recorded.actions)
+    result = fdtasil.distill(expert, made, 0, dataset=log, **run)
+    seen = OBSERVATIONS["dictionary"].of(recorded.observations[0])
+    assert result.student.predict(seen)[0].shape == (2,)
+    assert result.export(tmp_path / "s.onnx", inputs="keys").exists()

@@ -6,6 +6,7 @@ from dataclasses import replace
 import gymnasium
 import numpy as np
 import pytest
+from conftest import QUICK, TOY, mlp_onnx
 from toy_environments import Integrator
 
 import fdtasil
@@ -144,3 +145,14 @@ def test_steps_after_the_end_count_for_nothing():
         assert getattr(long, name) == pytest.approx(getattr(short, name)), name
     assert long.survival == 0
     assert long.imitation_gap > 0
+
+
+@pytest.mark.fault(314)
+def test_another_expert_than_the_runs_is_told_of(tmp_path):
+    own, other = mlp_onnx(tmp_path / "own.onnx"), mlp_onnx(tmp_path / "other.onnx", scale=0.5)
+    result = fdtasil.distill(own, TOY, 0, **QUICK)
+    look = {"episodes": 2, "horizon": 10, "progress": False}
+    for judge in (fdtasil.evaluate, fdtasil.diagnose):
+        judge(result, own, TOY, **look)
+        with pytest.warns(FdtasilWarning, match="own.onnx .* judged by other.onnx .*: another"):
+            judge(result, other, TOY, **look)

@@ -9,6 +9,7 @@ import pytest
 from conftest import GAIN, QUICK, TOY
 from onnx import TensorProto, helper, numpy_helper
 from toy_environments import Integrator
+from toy_forms import InForm
 
 import fdtasil
 from fdtasil.errors import ExpertError, SettingError
@@ -400,3 +401,17 @@ def test_a_beginning_is_seen_in_any_unit_and_behind_one_buffer(unit, keeps):
 
     with pytest.raises(ExpertError, match="another memory than zeros"):
         load_expert(FromOne(), N, 2)
+
+
+def test_a_memory_beside_parts_is_refused_with_what_to_do():
+    class OfParts:
+        def predict(self, observation, state=None, episode_start=None, deterministic=True):
+            count = len(observation["place"] if isinstance(observation, dict) else observation)
+            return np.zeros((count, 2)), np.zeros((count, 1))
+
+    with pytest.raises(ExpertError, match="no rows of a known length") as caught:
+        fdtasil.distill(OfParts(), lambda: InForm("dictionary"), 0, progress=False, **QUICK)
+    assert "FlattenObservation" in caught.value.next_step
+    with pytest.raises(ExpertError, match="no rows of a known length") as caught:
+        load_expert(OfParts()).ask(np.zeros((2, N)), "check")
+    assert "observation_size=n" in caught.value.next_step

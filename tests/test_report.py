@@ -166,10 +166,13 @@ def test_an_environment_that_is_more_than_its_id_is_left_to_the_reader():
         return np.clip(-8 * np.arctan2(rows[:, 1:2], rows[:, :1]) - 2 * rows[:, 2:], -2, 2)
 
     moon = fdtasil.Environment("Pendulum-v1", kwargs={"g": 1.6})
-    made = {"kwargs={'g': 1.6}": moon, "made by make_pendulum": make_pendulum}
+    made = {
+        "fdtasil.Environment('Pendulum-v1', kwargs={'g': 1.6}),": moon,
+        "env = ...  # Pendulum-v1, made by make_pendulum\n": make_pendulum,
+    }
     for said, env in made.items():
         run = fdtasil.distill(swing, env, 2, **QUICK)
-        assert f"env = ...  # Pendulum-v1, {said}\n" in call_of(run.settings, 1)
+        assert said in call_of(run.settings, 1)
         fdtasil.evaluate(run, swing, env, episodes=2, horizon=20)  # says nothing
     with pytest.warns(FdtasilWarning, match="in another Pendulum-v1 than it is judged in: its ob"):
         fdtasil.evaluate(run, swing, moon, episodes=2, horizon=20)
@@ -216,3 +219,24 @@ def test_the_call_of_the_card_leaves_a_length_that_grew_to_grow_again(linear):
     result = fdtasil.distill(linear, TOY, 0, **run, progress=False)
     assert result.report["steps"] > 4000
     assert "Fit(batch_size" in call_of(result.settings, 1)
+
+
+@pytest.mark.parametrize(
+    ("made", "code"),
+    [
+        ({"kwargs": {"g": 9.0}}, "fdtasil.Environment('Pendulum-v1', kwargs={'g': 9.0})"),
+        ({"kwargs": {"g": 9.0}, "reset_options": {"x_init": 1.0}}, "reset_options={'x_init': "),
+    ],
+)
+def test_an_environment_with_options_is_made_again_by_its_card(made, code):
+    swing = lambda x: np.clip(-8 * x[:, 1:2] - 2 * x[:, 2:], -2, 2)  # noqa: E731
+    run = {"episodes": 1, "horizon": 9, "evaluation_episodes": 0, "fit": fdtasil.Fit(steps=3)}
+    place = fdtasil.Environment("Pendulum-v1", **made)
+    result = fdtasil.distill(swing, place, 0, progress=False, **run)
+    call = call_of(result.settings, 1)
+    assert code in call
+    made_again = call_of({**result.settings, "made": "kwargs={}, **print(1)"}, 1)
+    assert "fdtasil.Environment" not in made_again
+    again = {}
+    exec(call.replace("expert = ...", "expert = swing"), {"swing": swing}, again)
+    assert again["result"].student.to_bytes() == result.student.to_bytes()

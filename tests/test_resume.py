@@ -1,5 +1,6 @@
 """A run that was killed goes on, and ends with the bytes of one that never was."""
 
+import json
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -293,3 +294,20 @@ def test_a_finished_run_is_not_handed_out_for_the_one_that_begins_in_its_place(
     assert (tmp_path / "run" / "checkpoints" / "config.json").exists()
     again = fdtasil.distill(expert, TOY, 0, seed=7, resume=tmp_path / "run", **run)
     assert again.settings["seed"] == 7
+
+
+@pytest.mark.fault(313)
+def test_a_run_that_has_begun_over_a_finished_one_is_told_of(quick, tmp_path, linear):
+    folder = quick.save(tmp_path / "run")
+    fdtasil.Distilled.load(folder)
+    left = folder / "checkpoints"
+    left.mkdir()
+    (left / "config.json").write_bytes((folder / "config.json").read_bytes())
+    fdtasil.Distilled.load(folder)  # its own, which could not be dropped
+    other = json.loads((folder / "config.json").read_text()) | {"seed": 9}
+    (left / "config.json").write_text(json.dumps(other))
+    with pytest.warns(FdtasilWarning, match="another one that has not ended"):
+        read = fdtasil.Distilled.load(folder)
+    assert read.student.to_bytes() == quick.student.to_bytes()
+    with pytest.warns(FdtasilWarning, match="another one that has not ended"):
+        fdtasil.evaluate(folder, linear, TOY, episodes=2, horizon=5, progress=False)

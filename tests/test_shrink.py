@@ -251,3 +251,13 @@ def test_where_no_share_means_anything_none_is_chosen(run, monkeypatch):
 def _unknown(job, _):
     plain = job.cloned is not None
     return Candidate(job.hidden, job.activation, plain, 1, 1, 1.0, None, None, 1.0)
+
+
+def test_another_environment_than_the_runs_is_told_of(linear):
+    gravity = fdtasil.Environment("Pendulum-v1", {"g": 5.0})
+    swing = lambda x: np.clip(-8 * x[:, 1:2] - 2 * x[:, 2:], -2, 2)  # noqa: E731
+    run = {"episodes": 1, "horizon": 20, "evaluation_episodes": 2, "progress": False}
+    result = fdtasil.distill(swing, gravity, 2, fit=fdtasil.Fit(steps=5), **run)
+    small = {"sizes": [(4,)], "fit": fdtasil.Fit(steps=5), "evaluation_episodes": 2}
+    with pytest.warns(FdtasilWarning, match="distilled in another Pendulum-v1"):
+        fdtasil.shrink(result, swing, "Pendulum-v1", keep=0.01, progress=False, **small)

@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+from dataclasses import dataclass
 
 import numpy as np
 import onnx
@@ -9,11 +10,11 @@ import onnxruntime
 import pytest
 import torch
 
-from fdtasil.errors import ExportError, SettingError, StorageError
+from fdtasil.errors import ExportError, FdtasilError, SettingError, StorageError
 from fdtasil.files.onnx.export import export_module
 from fdtasil.probes.scales import measure_scales
 from fdtasil.seeding import torch_generator
-from fdtasil.student.architectures import ACTIVATIONS, Mlp
+from fdtasil.student.architectures import ACTIVATIONS, ARCHITECTURES, Mlp
 from fdtasil.student.exports import export
 from fdtasil.student.plain import PlainPolicy
 from fdtasil.student.policy import Student
@@ -263,3 +264,20 @@ def test_what_float32_rounds_of_an_action_is_no_difference(suffix):
     random, states = torch.Generator().manual_seed(0), np.random.default_rng(0)
     student = Student(Mlp((16, 16)), np.zeros(4), np.ones(4), low, high, random).eval()
     assert export(student, states.standard_normal((500, 4)).astype(np.float32), {}, f"s{suffix}")
+
+
+def test_an_architecture_that_is_not_known_is_named(monkeypatch):
+    @dataclass(frozen=True)
+    class Flat:
+        width: int = 3
+
+        def build(self, observation_size, action_size, random):
+            return Mlp(self.width).build(observation_size, action_size, random)
+
+    monkeypatch.setitem(ARCHITECTURES, "flat", Flat)
+    random = torch.Generator().manual_seed(0)
+    data = Student(Flat(), np.zeros(2), np.ones(2), -np.ones(1), np.ones(1), random).to_bytes()
+    assert Student.from_bytes(data).architecture == Flat()
+    monkeypatch.delitem(ARCHITECTURES, "flat")
+    with pytest.raises(FdtasilError, match="architecture 'flat', which is not known here"):
+        Student.from_bytes(data)

@@ -14,7 +14,7 @@ from fdtasil.experts.sb3.trust import Trust
 from fdtasil.experts.silence import Silence
 from fdtasil.experts.worker_process import as_array
 from fdtasil.rollouts.behaviours import Policy, has_none
-from fdtasil.rollouts.spaces import Spaces
+from fdtasil.rollouts.spaces import Part, Spaces
 
 __all__ = ["Expert", "Hints", "Purpose", "RaisedElsewhere"]
 
@@ -273,7 +273,8 @@ class Expert:
         except ExpertError:
             raise
         except Exception as error:
-            raise _Raised.of(self.name, len(rows), expected, error, self._given) from error
+            flat = self._parts is None
+            raise _Raised.of(self.name, len(rows), expected, error, self._given, flat) from error
         if answer.shape == (len(rows), 1) and self.action_size and np.isnan(answer).all():
             answer = np.repeat(answer, self.action_size, axis=1)  # nulls in the place of rows
         if answer.ndim != 2 or len(answer) != len(rows) or not self._has_action_size(answer):
@@ -288,13 +289,18 @@ class Expert:
         return answer
 
     @property
+    def _parts(self) -> tuple[Part, ...] | None:
+        """What it is given apart; None for flat rows."""
+        layout = self.spaces.observations if self.spaces and self.own_form else None
+        return None if layout is None or layout.plain else layout.parts
+
+    @property
     def _given(self) -> str:
         """What it is called with, for who called it wrongly."""
-        layout = self.spaces.observations if self.spaces and self.own_form else None
-        if layout is None or layout.plain:
+        if self._parts is None:
             return "experts answer (B, n) with (B, m)"
         parts = [
-            f"{p.name or 'an array'} (B, {', '.join(map(str, p.shape))})" for p in layout.parts
+            f"{p.name or 'an array'} (B, {', '.join(map(str, p.shape))})" for p in self._parts
         ]
         return f"it is given what the environment gives, in a batch: {', '.join(parts[:6])}"
 
@@ -325,7 +331,9 @@ class _Raised(Exception):
         self.error, self.text, self.everywhere = error, text, everywhere
 
     @classmethod
-    def of(cls, name: str, rows: int, expected: str, error: Exception, given: str) -> "_Raised":
+    def of(
+        cls, name: str, rows: int, expected: str, error: Exception, given: str, flat: bool
+    ) -> "_Raised":
         """Return what an exception on so many rows is."""
         kind = error.kind if isinstance(error, RaisedElsewhere) else type(error).__name__
         said = in_one_line(error)
@@ -333,7 +341,7 @@ class _Raised(Exception):
             f"{name} raised {kind} on {rows} observations: {said}",
             expected,
             f"call it on such a batch on its own; {given}"
-            + (_EACH if kind in _OF_SHAPES and rows > 1 else ""),
+            + (_EACH if kind in _OF_SHAPES and rows > 1 and flat else ""),
         )
         whole.__cause__ = error
         return cls(whole, f"{kind}: {said}", everywhere=kind in _NOT_OF_A_ROW)

@@ -47,7 +47,7 @@ def open_predictor(
             return carried
     # DQN has a predict of its own, which is the policy's where nothing is random.
     scores = scores_of(getattr(source, "policy", source)) if chooses else None
-    answer = _Predicts(asked, name, options, statistics, scores)
+    answer = _Predicts(asked, name, options, statistics, scores, observation_size is not None)
     return Expert(answer, name, jacobian=own_jacobian(source))
 
 
@@ -76,6 +76,7 @@ class _Predicts:
         options: What `predict` is called with besides.
         statistics: The VecNormalize that it was trained in, or None.
         scores: What it chooses by, asked in its place; or None.
+        flat: Whether observations are flat rows of a known length, behind which a memory stands.
     """
 
     source: Any
@@ -83,6 +84,7 @@ class _Predicts:
     options: Mapping[str, bool]
     statistics: Any
     scores: Callable[[Any], np.ndarray] | None = None
+    flat: bool = True
 
     def __call__(self, observations: np.ndarray) -> np.ndarray:
         if self.statistics is not None:
@@ -93,6 +95,13 @@ class _Predicts:
         if not isinstance(result, tuple):
             return result
         actions, state = result
+        if state is not None and not self.flat:
+            raise ExpertError(
+                f"{self.name} returns a state, and observations are no rows of a known length",
+                "flat rows (B, n), behind which a memory stands",
+                "wrap the environment in gymnasium.wrappers.FlattenObservation; without one, "
+                "write load_expert(..., observation_size=n)",
+            )
         if state is not None:
             raise ExpertError(
                 f"{self.name} returns a state beside its actions",

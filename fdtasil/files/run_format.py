@@ -2,11 +2,12 @@
 
 import os
 import re
+import shlex
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from fdtasil.errors import StorageError, shown
+from fdtasil.errors import StorageError, shown, warn
 from fdtasil.files.lock import was_locked
 from fdtasil.files.names import check_no_links, inside
 from fdtasil.files.reading import from_json, read_plain
@@ -22,6 +23,7 @@ __all__ = [
     "REPORT",
     "STATES",
     "WEIGHTS",
+    "begun_over",
     "check_finished",
     "check_free",
     "stamped",
@@ -81,18 +83,39 @@ def _another_format(number: object, values: Mapping[str, Any], source: object) -
 
 
 def check_finished(folder: Path) -> None:
-    """Refuse the folder of a run that has not ended.
+    """Refuse the folder of a run that has not ended; warn of one in the place of a finished run.
 
     Raises:
         StorageError: If it is one.
     """
-    if is_written(folder) or not (folder / CHECKPOINTS).is_dir():
+    if is_written(folder):
+        if begun_over(folder):
+            warn(
+                f"{folder} holds a finished run, and another one that has not ended and will "
+                "replace it: the finished one is read"
+            )
         return
+    if not (folder / CHECKPOINTS).is_dir():
+        return
+    again = f"fdtasil distill --resume {shlex.quote(str(folder))}"
     raise StorageError(
         f"{folder} holds a run that has not ended",
         "a finished run",
-        f'go on with it: resume="{folder}" and else the same (fdtasil distill --resume {folder})',
+        f'go on with it: resume="{folder}" and else the same ({again})',
     )
+
+
+def begun_over(folder: Path) -> bool:
+    """Whether another run has begun in the folder of a finished one.
+
+    What is left of checkpoints may be the finished one's own.
+    """
+    left = inside(folder, f"{CHECKPOINTS}/{CONFIG}")
+    if not left.exists():
+        return False
+    now = inside(folder, CONFIG)
+    mine, theirs = (read_plain(file, _OURS_LIMIT, follow=False) for file in (now, left))
+    return mine != theirs
 
 
 def check_free(folder: Path) -> None:

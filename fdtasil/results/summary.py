@@ -1,5 +1,6 @@
 """What a run comes to, as rows of a table: the model card and the page are made of them."""
 
+import ast
 from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
@@ -50,7 +51,7 @@ def call_of(settings: Mapping[str, Any], history: int) -> str:
     """Return the call of a run, as far as its settings say it.
 
     Functions, datasets, and environments that gymnasium does not know stand in no file: they are
-    named, and left to the reader; so are environments that are more than their id.
+    named, and left to the reader.
 
     Args:
         settings: Of the run's configuration.
@@ -58,7 +59,8 @@ def call_of(settings: Mapping[str, Any], history: int) -> str:
     """
     lost = _in_no_file(settings)
     expert, env, data = settings["expert"], _environment(settings), settings.get("dataset")
-    given = ["expert" if "expert" in lost else repr(expert), "env" if "env" in lost else repr(env)]
+    place = _made_anew(settings) or repr(env)
+    given = ["expert" if "expert" in lost else repr(expert), "env" if "env" in lost else place]
     probes = settings["probes"]
     given.append("0" if probes == "none" else repr(probes))
     recorded = () if data else ("trainer", "episodes")
@@ -96,6 +98,23 @@ def call_of(settings: Mapping[str, Any], history: int) -> str:
     return f"import fdtasil\n\n{first}result = fdtasil.distill(\n{inside},\n)\n"
 
 
+def _made_anew(settings: Mapping[str, Any]) -> str | None:
+    """Return the code of an environment with options; None of another, or whose words are none."""
+    name = _environment(settings)
+    if settings.get("made") is None or not _is_id(name):
+        return None
+    try:
+        call = ast.parse(f"dict({settings['made']})", mode="eval").body
+        words = call.keywords if isinstance(call, ast.Call) and not call.args else []
+        told = {str(one.arg): ast.literal_eval(one.value) for one in words}
+    except (SyntaxError, ValueError):
+        return None
+    if not told or not told.keys() <= {"kwargs", "reset_options"}:
+        return None
+    options = ", ".join(f"{name}={value!r}" for name, value in told.items())
+    return f"fdtasil.Environment({name!r}, {options})"
+
+
 def _trainer(described: str) -> str:
     """Return the code of a trainer; its name, where it has the usual settings."""
     name, odd, settings = described.partition(",")
@@ -122,7 +141,7 @@ def _in_no_file(settings: Mapping[str, Any]) -> dict[str, str]:
     seen = settings.get("student_obs")
     found = {
         "expert": _expert_in_words(settings),
-        "env": _environment_in_words(env, settings.get("made")),
+        "env": None if _made_anew(settings) else _environment_in_words(env, settings.get("made")),
         "dataset": data and f"sha256 {data}",
         "student_obs": seen if isinstance(seen, str) else None,  # a function
     }
@@ -142,6 +161,9 @@ def _environment_in_words(name: str | None, made: str | None) -> str | None:
     """Return what an environment is; None where gymnasium makes it of its name alone."""
     if made is not None:
         return f"{name}, {made}"
+    return None if _is_id(name) else name
+
+
+def _is_id(name: str | None) -> bool:
     # "module:Id" is registered once the module is imported.
-    known = name is not None and (":" in name or name in gymnasium.registry)
-    return None if known else name
+    return name is not None and (":" in name or name in gymnasium.registry)

@@ -1,6 +1,7 @@
 """What an environment argument means: an id, an instance or a factory, and its two spaces."""
 
 import copy
+import os
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -153,6 +154,12 @@ class EnvironmentPool:
         )
         if wanted.kwargs:
             self._advice = f"check the names in kwargs ({', '.join(map(str, wanted.kwargs))})"
+        if isinstance(given, str) and given not in gymnasium.registry and os.path.isfile(given):
+            raise EnvironmentFault(
+                f"the file {given} in the place of the environment",
+                "the expert, then a gymnasium id",
+                f"write {given} Pendulum-v1, say",
+            )
         self._make = wanted.factory()
         self._members: list[gymnasium.Env] = []
         self._kept: list[gymnasium.Env] = []  # only to be closed

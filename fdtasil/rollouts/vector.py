@@ -177,7 +177,8 @@ def _check_layers(env: Any, inner: str) -> None:
                 f"the environment is inside {kind}, which changes with what it has seen",
                 "one that gives what it observes, and an expert that normalises by itself",
                 f"pass what is inside (its .{inner}); an agent that was trained so keeps its "
-                "statistics: pass the agent itself, or its zip with the statistics beside it",
+                "statistics: pass the agent itself, or what `fdtasil export-sb3 --vecnormalize` "
+                "makes of its zip",
             )
         layer = vars(layer).get(inner)
 

@@ -39,6 +39,7 @@ from fdtasil.run.judging import (
     judged_in,
     judged_through,
     warn_of_another_environment,
+    warn_of_another_expert,
 )
 from fdtasil.run.presets import PRESETS
 from fdtasil.seeding import episode_seeds, generator
@@ -116,6 +117,7 @@ def diagnose(
         m = pool.boxes.action_size
         act = acting(judged, student_obs, visited, m, purpose="check")
         warn_of_another_environment(student, pool)
+        warn_of_another_expert(student, asked)
         scales = measure_scales(visited)
         scales = replace(scales, live=scales.live & np.isin(np.arange(visited.shape[1]), present))
         pair = _Pair(pool, asked, act, scales, _units(pool), starts, seed, history > 1)

@@ -23,12 +23,14 @@ __all__ = [
     "warn_of_silence",
     "warn_of_small_units",
     "warn_of_still_coordinates",
+    "warn_of_whole_numbers",
 ]
 
 _FEW = 5  # demonstrations, of which each counts
 _USUALLY = 0.75  # share of the expert's episodes that it survives
 _MISFIT = 0.15  # share of the actions' deviation; students of the experts here reach 0.01
 _RAISED = "; each row of a batch that raises is asked again, alone: a row of NaN costs no query"
+_CHOICES = 20  # values that a mode has at most
 _SHOWN = 8  # coordinates named in a warning
 _CLEARLY = 4  # of float32's steps, that rounding does not move a coordinate by
 _SMALL = 1e-4  # of the median deviation; robots' observations differ by less
@@ -162,18 +164,21 @@ def _listed(found: np.ndarray, deviations: np.ndarray) -> tuple[str, str]:
     return told, f" and {len(found) - _SHOWN} more" if len(found) > _SHOWN else ""
 
 
-def warn_of_still_coordinates(lesson: Lesson, expert: Episodes) -> None:
+def warn_of_still_coordinates(lesson: Lesson, expert: Episodes | None) -> None:
     """Warn of coordinates of which few demonstrations show few values.
 
     Args:
         lesson: What is learnt from.
-        expert: (E, T) the expert's own episodes, from other starts.
+        expert: (E, T) the expert's own episodes, from other starts; or None.
     """
     states, scales = lesson.dataset.demonstrations, lesson.scales
     count = len(np.unique(states.episode))
-    number = np.broadcast_to(np.arange(len(expert.valid))[:, None], expert.valid.shape)
-    seen = expert.observations[expert.valid]
-    still = stands_still(seen, number[expert.valid]) & scales.seen & ~scales.told
+    seen, number = states.observations, states.episode
+    if expert is not None:
+        theirs = np.broadcast_to(np.arange(len(expert.valid))[:, None], expert.valid.shape)
+        seen = np.concatenate([seen, expert.observations[expert.valid]])
+        number = np.concatenate([number, number.max() + 1 + theirs[expert.valid]])
+    still = stands_still(seen, number) & scales.seen & ~scales.told
     found = np.flatnonzero(still)
     if not len(found) or count > 2 * _FEW:
         return
@@ -182,5 +187,19 @@ def warn_of_still_coordinates(lesson: Lesson, expert: Episodes) -> None:
     warn(
         f"{len(found)} coordinates stand still within an episode and differ between episodes, "
         f"such as a command, a goal or a mass; {count} demonstrations show {count} values of "
-        f"them: spread={{{told}}}{more} probes them as far as the expert's own episodes differ"
+        f"them: spread={{{told}}}{more} probes them as far as the episodes that were seen differ"
     )
+
+
+def warn_of_whole_numbers(lesson: Lesson) -> None:
+    """Warn of coordinates that may be a mode or a flag, of which no space has said so."""
+    states, scales = lesson.dataset.demonstrations.observations, lesson.scales
+    whole = (states == np.round(states)).all(axis=0) & scales.seen & scales.live & ~scales.told
+    found = [i for i in np.flatnonzero(whole) if len(np.unique(states[:, i])) <= _CHOICES]
+    if len(states) > _CHOICES and found:
+        listed = ", ".join(map(str, found[:_SHOWN])) + ", ..." * (len(found) > _SHOWN)
+        warn(
+            f"coordinates that are whole numbers in every state ({listed}) are probed as any "
+            "others: if they are modes or flags, the expert is asked between them. An "
+            "environment whose space says so (Discrete, MultiBinary) keeps them as they are"
+        )

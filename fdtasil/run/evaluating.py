@@ -24,6 +24,7 @@ from fdtasil.run.judging import (
     judged_in,
     judged_through,
     warn_of_another_environment,
+    warn_of_another_expert,
 )
 from fdtasil.run.subject import named
 from fdtasil.seeding import episode_seeds
@@ -103,4 +104,5 @@ def evaluate(
         visited = theirs.observations[theirs.valid]
         student = follow_answers(acting(judged, student_obs, visited, m, remembered=remembered))
         warn_of_another_environment(policy, pool)
+        warn_of_another_expert(policy, black_box)
         return evaluate_pair(student, black_box, theirs, pool, length, seed, bars, limits, n)

@@ -2,6 +2,7 @@
 
 import os
 import re
+import shlex
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
@@ -12,7 +13,14 @@ from fdtasil.errors import FdtasilError, SettingError, StorageError, warn
 from fdtasil.files.lock import locked
 from fdtasil.files.names import check_no_links, inside
 from fdtasil.files.reading import read_plain
-from fdtasil.files.run_format import CHECKPOINTS, CONFIG, check_free, stamped, unstamped
+from fdtasil.files.run_format import (
+    CHECKPOINTS,
+    CONFIG,
+    begun_over,
+    check_free,
+    stamped,
+    unstamped,
+)
 from fdtasil.files.storage import (
     explain,
     is_written,
@@ -66,7 +74,8 @@ def open_run_folder(
     else:
         check_free(path)
     before = _read_config(path) if resume else None
-    going_on = f'go on with resume="{path}" in the place of out=, else the same (--resume {path})'
+    flag = f"--resume {shlex.quote(str(path))}"
+    going_on = f'go on with resume="{path}" in the place of out=, else the same ({flag})'
     with locked(path):
         if before is not None:
             _check_same(before, config, path, finished=folder.finished)
@@ -120,13 +129,7 @@ class RunFolder:
         """Whether the folder holds a finished run."""
         if self._path is None or self.begun or not is_written(self._path):
             return False
-        # What is left of checkpoints may be its own, or of another run that begins in its place.
-        left = inside(self._path, f"{CHECKPOINTS}/{CONFIG}")
-        if not left.exists():
-            return True
-        now = inside(self._path, CONFIG)
-        mine, theirs = (read_plain(file, _CONFIG_LIMIT, follow=False) for file in (now, left))
-        return mine == theirs
+        return not begun_over(self._path)
 
     def save(
         self, round_: int, stage: str, number: int, files: Callable[[], dict[str, bytes]]

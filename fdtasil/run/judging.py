@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 
 from fdtasil.checks import check_count
-from fdtasil.errors import SettingError, warn
+from fdtasil.errors import SettingError, shown, warn
 from fdtasil.experts.expert import Expert, Hints, Purpose
 from fdtasil.experts.load import ExpertLike, open_expert, sized
 from fdtasil.experts.onnx_expert import said_history
@@ -30,6 +30,7 @@ __all__ = [
     "judged_in",
     "judged_through",
     "warn_of_another_environment",
+    "warn_of_another_expert",
 ]
 
 
@@ -64,6 +65,18 @@ def warn_of_another_environment(policy: ExpertLike | Distilled, pool: Environmen
         return
     if other := other_environment(before, now):
         warn(f"the student was distilled in another {names[0]} than it is judged in: {other[0]}")
+
+
+def warn_of_another_expert(policy: ExpertLike | Distilled, expert: Expert) -> None:
+    """Warn where a run's student is judged by another file than it was distilled from."""
+    if not isinstance(policy, Distilled):
+        return
+    before, now = policy.settings.get("expert_sha256"), expert.sha256
+    if before and now and before != now:
+        warn(
+            f"the student was distilled from {shown(policy.settings['expert'])} with the sha256 "
+            f"{before[:8]}..., and is judged by {expert.name} with {now[:8]}...: another expert"
+        )
 
 
 def judged_through(

@@ -28,6 +28,7 @@ from fdtasil.run.doubts import (
     warn_of_rounded_movement,
     warn_of_small_units,
     warn_of_still_coordinates,
+    warn_of_whole_numbers,
 )
 from fdtasil.run.events import Event
 from fdtasil.run.lesson import Lesson
@@ -90,8 +91,10 @@ class Rounds:
             warn_of_rounded_movement(lesson)
         if expert is not None and round_ == 0 and self.collecting is not None:
             warn_of_falls(lesson.dataset.demonstrations, expert, self.run.keep)
-        if expert is not None and last and self.run.can_spread:
+        if last and self.run.can_spread:
             warn_of_still_coordinates(lesson, expert)
+            if self.run.spaces is None:
+                warn_of_whole_numbers(lesson)
 
     def _trained(self, round_: int, lesson: Lesson, before: Trained | None) -> Trained:
         with self.training.interrupts.held_back():

@@ -20,11 +20,12 @@ from fdtasil.progress import Progress
 from fdtasil.results.distilled import Distilled
 from fdtasil.results.evaluation import Evaluation, interval_text, score_text
 from fdtasil.results.figures import draw_sizes
-from fdtasil.rollouts.environments import EnvironmentLike
+from fdtasil.rollouts.environments import EnvironmentLike, EnvironmentPool
 from fdtasil.rollouts.wanted import Environment, import_module_of
 from fdtasil.run.elsewhere import side_by_side
 from fdtasil.run.evaluating import evaluate
 from fdtasil.run.folder import RunFolder
+from fdtasil.run.judging import warn_of_another_environment
 from fdtasil.run.pipeline import distill
 from fdtasil.student.architectures import Mlp
 from fdtasil.student.fit import Fit
@@ -217,6 +218,8 @@ def shrink(
             "leave workers= out",
         )
     folder = None if out is None else check_path("out", out).absolute()
+    with EnvironmentPool(env) as pool:
+        warn_of_another_environment(result, pool)
     if horizon is None and not result.settings["horizon"]:
         raise SettingError(
             "a run without an environment, and so without a horizon",

@@ -125,8 +125,9 @@ def open_subject(
                 raise SettingError(
                     f"{opened.name}, which remembers {remembered or 'nothing'}, beside states of "
                     f"one that remembered {given.remembered or 'nothing'}",
-                    "the expert that they were recorded with",
-                    "pass it, or none: then nobody is asked",
+                    "the expert that they were recorded with, and its memory beside them",
+                    "pass it, or none (nobody is asked, and probes=0 learns from the actions)"
+                    + ("" if pool is None else ", or leave dataset= out, and it is recorded here"),
                 )
         size = n + past + remembered
         yield Subject(opened, pool, name, size, m, history, past, remembered, spaces)
@@ -142,8 +143,8 @@ def _without_memory(expert: Expert) -> Expert:
         return expert
     raise SettingError(
         f"{expert.name}, which has a memory, without an environment",
-        "one in which it is remembered",
-        "pass env=",
+        "one in which it is remembered: what it remembered at recorded states is not known",
+        "pass env= and no dataset; or pass no expert, and probes=0 learns from the actions",
     )
 
 

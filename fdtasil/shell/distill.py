@@ -2,14 +2,19 @@
 
 import inspect
 import os
+import shlex
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+import gymnasium
+
 from fdtasil.errors import SettingError, StorageError, shown, without_secrets
 from fdtasil.experts.expert import rows_text
+from fdtasil.experts.http_expert import is_http_url
+from fdtasil.experts.hub import is_hub_uri
 from fdtasil.files.border import reads
 from fdtasil.files.lock import locked
 from fdtasil.files.names import inside
@@ -45,6 +50,7 @@ def _distill(baseline: bool, **arguments: Any) -> None:
     resume = arguments["resume"]
     if arguments["device"] is None:
         del arguments["device"]  # the library's own, or the one that the run was begun on
+    _check_places(arguments)
     import_module_of(arguments["env"])
     if resume is not None and arguments["expert"] is None and arguments["env"] is None:
         _check_alone(resume, sys.argv)
@@ -70,6 +76,39 @@ def _distill(baseline: bool, **arguments: Any) -> None:
     print(f"saved in {out}: student.onnx, student.safetensors, report.json, figures/, ...")
 
 
+def _check_places(arguments: dict[str, Any]) -> None:
+    """Refuse two folders, and flags that have swallowed what stands behind them.
+
+    Raises:
+        SettingError: If there are some.
+    """
+    if arguments["resume"] is not None and _flags(sys.argv) & {"--out"}:
+        raise SettingError(
+            f"--out beside --resume {arguments['resume']}",
+            "one folder: a run ends where it began",
+            "leave --out out",
+        )
+    if arguments["expert"] is not None and arguments["env"] is not None:
+        return
+    for name in ("student_obs", "log_formats"):
+        taken = arguments[name] or ()
+        if eaten := [word for word in taken if _is_expert(word) or word in gymnasium.registry]:
+            flag = f"--{name.replace('_', '-')}"
+            raise SettingError(
+                f"{flag} {' '.join(taken)}",
+                f"EXPERT and ENV before flags of several values, which take {eaten[0]} along",
+                f"write fdtasil distill {' '.join(eaten)} {flag} ...",
+            )
+
+
+def _is_expert(word: str) -> bool:
+    return Path(word).suffix in (".onnx", ".zip", ".c") or is_http_url(word) or is_hub_uri(word)
+
+
+def _flags(line: list[str]) -> set[str]:
+    return {word.partition("=")[0] for word in line if word.startswith("--")}
+
+
 @contextmanager
 def _remembering(arguments: dict[str, Any], folder: Path) -> Iterator[None]:
     """Keep the arguments of a run beside it, for `--resume`; not those of one that never began."""
@@ -79,7 +118,8 @@ def _remembering(arguments: dict[str, Any], folder: Path) -> Iterator[None]:
         yield
         return
     if is_written(folder):
-        print(f"{arguments['out']} holds a finished run, which this one replaces", file=sys.stderr)
+        told = f"{arguments['out']} holds a finished run, which this one replaces when it ends"
+        print(told, file=sys.stderr)
     plain = {k: str(v) if isinstance(v, Path) else v for k, v in arguments.items()}
     alone = not folder.parent.exists()
     with locked(folder):  # another run's arguments stay its own
@@ -108,11 +148,10 @@ def _check_alone(resume: Path, line: list[str]) -> None:
     Raises:
         SettingError: If there are some.
     """
-    flags = [word.partition("=")[0] for word in line if word.startswith("--")]
-    given = [flag for flag in flags if flag[2:].replace("-", "_") not in _BESIDE]
+    given = {flag for flag in _flags(line) if flag[2:].replace("-", "_") not in _BESIDE}
     if given:
         raise SettingError(
-            f"{', '.join(given)} beside --resume {resume}",
+            f"{', '.join(sorted(given))} beside --resume {resume}",
             "--resume alone: a run goes on as it was begun",
             "leave them out, or begin another run with --out",
         )
@@ -125,7 +164,8 @@ def _remembered(folder: Path) -> dict[str, Any]:
         SettingError: If there are none, or the environment would import a module that only a
             file names.
     """
-    again = f"repeat the arguments: fdtasil distill EXPERT ENV ... --resume {folder}"
+    name = shlex.quote(str(folder))
+    again = f"repeat the arguments: fdtasil distill EXPERT ENV ... --resume {name}"
     try:
         path = inside(folder, COMMAND)
         arguments = unstamped(read_plain(path, _LIMIT, follow=False), path, older=True)

@@ -36,6 +36,8 @@ COMMANDS = {
 
 def main() -> None:
     """Run the command line; exit code 0 done, 1 failed, 2 wrong use, 128 + N signal N."""
+    if isinstance(sys.stdout, io.TextIOWrapper):  # a path may have letters that it lacks
+        sys.stdout.reconfigure(errors="backslashreplace")
     try:
         try:
             _main()

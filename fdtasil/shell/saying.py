@@ -11,8 +11,13 @@ from fdtasil.shell.command import OptionalPath
 
 __all__ = ["JSON_FLAG", "json_file", "say"]
 
+_PRINTED = Path("-")
 JSON_FLAG: dict[str, tuple[Any, Any, str]] = {
-    "json": (OptionalPath, None, "File that all of it is written into too, as JSON."),
+    "json": (
+        OptionalPath,
+        None,
+        "File that all of it is written into too, as JSON; - prints that alone.",
+    ),
 }
 """Arguments of a command that finds something out."""
 
@@ -31,14 +36,19 @@ def json_file(path: Path | None) -> Path | None:
     Raises:
         SettingError: If its name ends otherwise.
     """
+    if path == _PRINTED:
+        return path
     return None if path is None else check_suffix(path, ".json").absolute()
 
 
 def say(found: Found, file: Path | None) -> None:
     """Write what was found, where there is a file from `json_file`, and print it."""
+    text = json.dumps(without_infinities(found.to_json())[0], indent=2)
+    if file == _PRINTED:
+        print(text)
+        return
     if file is not None:  # first: who reads the print may stop to
-        plain, _ = without_infinities(found.to_json())
-        write_bytes(file, json.dumps(plain, indent=2).encode())
+        write_bytes(file, text.encode())
     print(found)
     if file is not None:
         print(f"written: {file}")

@@ -10,7 +10,7 @@ import torch
 from torch import nn
 
 from fdtasil.checks import check_choice, check_count, spelt
-from fdtasil.errors import SettingError
+from fdtasil.errors import SettingError, shown
 
 __all__ = [
     "ACTIVATIONS",
@@ -137,12 +137,18 @@ def architecture_of(fields: dict[str, Any]) -> Architecture:
     """Return the architecture that `describe` described.
 
     Raises:
-        KeyError: If there is none of that name.
         TypeError: If it has other fields.
-        SettingError: If they have values that can't be used.
+        SettingError: If there is none of that name here, or they have values that can't be used.
     """
     fields = {name: tuple(v) if isinstance(v, list) else v for name, v in fields.items()}
-    return ARCHITECTURES[fields.pop("architecture", _USUAL)](**fields)
+    name = fields.pop("architecture", _USUAL)
+    if name not in ARCHITECTURES:
+        raise SettingError(
+            f"a student of the architecture {shown(name)!r}, which is not known here",
+            f"one of {', '.join(ARCHITECTURES)}",
+            "import the code that puts it into ARCHITECTURES first; its student.onnx needs none",
+        )
+    return ARCHITECTURES[name](**fields)
 
 
 def _linear(inputs: int, outputs: int, random: torch.Generator) -> nn.Linear:

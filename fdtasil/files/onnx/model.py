@@ -24,7 +24,11 @@ _ENDS = (".zip", ".onnx")  # which stable-baselines3 and users leave out
 _IMPOSTORS = {
     b"<": ("an HTML or XML page", "download the file itself, not the page about it"),
     b"version https://git-lfs": ("a git-LFS pointer", "run `git lfs pull`"),
-    b"\x80": ("a Python pickle", "export the controller to ONNX; pickles are never opened"),
+    b"\x80": (
+        "a Python pickle",
+        "export the controller to ONNX; pickles are never opened (statistics of a VecNormalize go "
+        "to fdtasil export-sb3 --vecnormalize)",
+    ),
     b"\x89HDF": ("an HDF5 file, as Keras writes", "load it with its own library, and wrap it"),
     b"\x1f\x8b": ("compressed by gzip", "unpack it first: gunzip"),
     b"{": ("a JSON text", "name the model itself"),
@@ -111,10 +115,10 @@ def side_files(data: bytes) -> set[str]:
 def _read_bytes(path: Path) -> bytes:
     if path.is_dir():
         check_finished(path)
-        inside = ", ".join(sorted(p.name for p in path.glob("*.onnx"))[:5]) or "none"
+        names = sorted(p.name for end in _ENDS for p in path.glob(f"*{end}"))
         raise ExpertError(
-            f"{path} is a folder (ONNX files inside: {inside})",
-            "an ONNX file",
+            f"{path} is a folder (experts inside: {', '.join(names[:5]) or 'none'})",
+            "an ONNX file, or the zip of an agent",
             "name the file itself",
         )
     beside = [p.name for p in (path.with_name(f"{path.name}{end}") for end in _ENDS) if p.exists()]
