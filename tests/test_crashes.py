@@ -200,6 +200,7 @@ def states(expert, tmp_path_factory):
 
 
 @pytest.mark.fault(109)
+@pytest.mark.filterwarnings("ignore:.* and another one that has not ended")
 @pytest.mark.parametrize("every", [41, pytest.param(1, marks=pytest.mark.slow)])
 @pytest.mark.parametrize("forever", [False, True])
 def test_any_write_may_fail(every, forever, expert, states, tmp_path, monkeypatch, figure):
