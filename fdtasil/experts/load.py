@@ -390,7 +390,7 @@ _INPUTS = _PARTS | {"inputs", "memory"}
 KINDS = (
     Kind(lambda source: isinstance(source, Expert), _from_expert),
     Kind(is_http_url, _from_http, called="a server", remote=True),
-    Kind(is_hub_uri, _from_hub, _INPUTS | _TRUST, "a file of the hub"),
+    Kind(is_hub_uri, _from_hub, _INPUTS, "a file of the hub"),
     Kind(_is_zip, _from_agent, _TRUST, "an agent's zip"),
     Kind(_is_c, open_c, _TRUST, "a C file"),
     Kind(_is_path, open_onnx, _INPUTS, "an ONNX file"),

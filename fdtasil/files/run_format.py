@@ -110,12 +110,11 @@ def begun_over(folder: Path) -> bool:
 
     What is left of checkpoints may be the finished one's own.
     """
-    left = inside(folder, f"{CHECKPOINTS}/{CONFIG}")
-    if not left.exists():
+    files = inside(folder, CONFIG), inside(folder, f"{CHECKPOINTS}/{CONFIG}")
+    if not all(file.exists() for file in files):
         return False
-    now = inside(folder, CONFIG)
-    mine, theirs = (read_plain(file, _OURS_LIMIT, follow=False) for file in (now, left))
-    return mine != theirs
+    now, left = (read_plain(file, _OURS_LIMIT, follow=False) for file in files)
+    return now != left
 
 
 def check_free(folder: Path) -> None:
