@@ -330,7 +330,7 @@ FAULTS = {
         309: "a memory's beginning, of answers in small units or in one buffer",
         310: "a Minari dataset that does not say what its rows are",
         311: "own derivatives beside a large number that stands still",
-        312: "derivatives of a module that are not finite",
+        312: "derivatives of a module that are none, where an action stood in their place",
         313: "a run that has begun over a finished one, which is read without a word",
         314: "a run that is judged by another expert than its own",
         315: "a setpoint that stands still in a log, or where nothing is evaluated",

@@ -212,6 +212,16 @@ def test_agents_that_choose(name, tmp_path):
     assert np.array_equal(ours[0].argmax(1), expected)
 
 
+def test_the_policy_of_an_agent_that_chooses(tmp_path):
+    agent = shake(fresh_agent("DQN", "CartPole-v1", {"net_arch": [9]}))
+    rows = np.random.default_rng(0).standard_normal((50, 4)).astype(np.float32)
+    expected = agent.predict(rows, deterministic=True)[0]
+    fdtasil.load_expert(agent.policy, 4, 2)
+    with EnvironmentPool("CartPole-v1") as pool:
+        found = expert_in(agent.policy, pool).ask(rows, "check")
+    assert np.array_equal(found.argmax(1), expected)
+
+
 def test_several_choices_of_an_agent(tmp_path):
     agent = shake(fresh_agent("PPO", InForm("box", "choices"), {}))
     rows = rows_of()

@@ -476,7 +476,7 @@ def test_two_folders_and_swapped_arguments(inside, tmp_path):
     expert = mlp_onnx(tmp_path / "e.onnx")
     done = inside("distill", expert, TOY, "--resume", "a", "--out", "b", cwd=tmp_path)
     assert done.returncode == 2
-    assert "--out beside --resume a" in done.stderr
+    assert "--out b beside --resume a" in done.stderr
     done = inside("distill", TOY, expert, cwd=tmp_path)
     assert done.returncode == 1
     assert "in the place of the environment" in done.stderr

@@ -647,6 +647,12 @@ def test_a_setpoint_of_a_log_is_warned_of_without_an_evaluation(linear):
         fdtasil.distill(linear, None, 3, dataset=log, fit=Fit(steps=3), progress=False)
 
 
+def test_episodes_of_one_state_say_nothing_of_what_stands_still(linear):
+    states = np.random.default_rng(0).standard_normal((6, 5))
+    log = fdtasil.from_arrays(states, linear(states), episode_ends=[1, 2, 3, 4, 5, 6])
+    fdtasil.distill(linear, None, 2, dataset=log, fit=Fit(steps=3), progress=False)
+
+
 @pytest.mark.fault(316)
 def test_modes_and_flags_of_a_log_are_warned_of_where_they_are_probed(linear):
     random = np.random.default_rng(0)
@@ -658,7 +664,8 @@ def test_modes_and_flags_of_a_log_are_warned_of_where_they_are_probed(linear):
         fdtasil.distill(linear, None, 3, **run)
     fdtasil.distill(linear, None, 3, student_obs=[0, 1, 3], **run)
     fdtasil.distill(None, None, 0, **run)
-    states[:, 2], states[:, 4] = np.arange(80), random.standard_normal(80)  # steps of a motor
+    states[:, 2] = np.arange(80)  # steps of a motor
+    states[:, 4] = np.arange(80) == 40  # a force that is cut, seldom at its end
     counted = fdtasil.from_arrays(states, linear(states))
     fdtasil.distill(linear, None, 3, **{**run, "dataset": counted})
 

@@ -442,7 +442,7 @@ def test_an_output_of_what_has_none():
         def predict(self, rows):
             return rows[:, :2]
 
-    with pytest.raises(SettingError, match="no parts"):
+    with pytest.raises(SettingError, match="output= of a Predicts"):
         fdtasil.load_expert(Predicts(), 5, 2, output="u")
     with pytest.raises(ExpertError, match="no part 'u'"):
         fdtasil.load_expert(lambda rows: rows[:, :2], 5, 2, output="u").ask(

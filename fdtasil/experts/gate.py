@@ -34,7 +34,7 @@ _SAME = 1e-4
 _LEAST = 0.1  # of an action's size, what counts as its range at least
 # Of the bounds' range too, times _SAME: a last layer that scales to them rounds by some digits of
 # float32 more.
-_SCALED = 0.01
+_SCALED = 0.1
 
 
 @dataclass(frozen=True)

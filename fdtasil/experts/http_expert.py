@@ -72,12 +72,11 @@ def _parse(url: str) -> SplitResult:
         raise _no_address(url, "its host or port can't be read") from None
     if not usable:
         raise _no_address(url, "no host, or characters that have to be quoted")
-    if parts.path.lower().endswith((".onnx", ".zip")):
-        uri = uri_of_page(url)
+    if uri := uri_of_page(url):
         raise ExpertError(
             f"{without_secrets(url)} is the address of a file",
             "the address of a server that answers with actions",
-            f"write {uri}" if uri else "download the file, and name its path",
+            f"write {uri}",
         )
     if parts.username is not None or parts.password is not None:
         # Said without the address: it would print the password.
@@ -139,7 +138,7 @@ class _Client:
         end = time.monotonic() + self._timeout
         try:
             used = connection.sock is not None and self._is_quiet(connection)
-            with _Deadline(end) as deadline:
+            with _Deadline(connection, end) as deadline:
                 try:
                     response = self._request(connection, body, deadline)
                 except ConnectionError:
@@ -313,14 +312,14 @@ class _Deadline:
     A timeout of a socket begins anew with every byte that comes.
 
     Attributes:
-        line: The socket that is cut; None until there is one.
+        line: The socket that is cut; None for the connection's.
         over: Whether it was.
     """
 
     line: socket.socket | None
 
-    def __init__(self, end: float) -> None:
-        self._end, self.line = end, None
+    def __init__(self, connection: http.client.HTTPConnection, end: float) -> None:
+        self._connection, self._end, self.line = connection, end, None
         self._clock = threading.Timer(max(end - time.monotonic(), 0), self._cut)
         self._clock.daemon = True
         self.over = False
@@ -351,10 +350,10 @@ class _Deadline:
             raise TimeoutError("the exchange did not end in time") from error
 
     def _cut(self) -> None:
-        self.over = True
-        if self.line is not None:
+        self.over, line = True, self.line or self._connection.sock
+        if line is not None:
             with suppress(OSError):
-                self.line.shutdown(socket.SHUT_RDWR)
+                line.shutdown(socket.SHUT_RDWR)
 
 
 def _line(text: str | bytes) -> str:

@@ -186,7 +186,7 @@ def open_expert(source: ExpertLike, hints: Hints) -> Expert:
     told = {name: value for name, value in told.items() if value is not None}
     for name in told.keys() & _TAKEN_BY.keys() - kind.takes:
         raise SettingError(
-            f"{name}={told[name]!r} of {kind.called or f'a {type(source).__name__}'}",
+            f"{name}= of {kind.called or f'a {type(source).__name__}'}",
             _TAKEN_BY[name],
             "leave it out",
         )
@@ -332,7 +332,7 @@ def _is_the_policy(module: torch.nn.Module, observation_size: int | None) -> boo
     if not isinstance(called, np.ndarray):  # PPO's says actions, values and log-probabilities
         return False
     return called.shape == asked.shape and np.allclose(
-        called, asked, atol=1e-5 * largest_action(asked)
+        called, asked, atol=1e-5 * largest_action(asked.reshape(len(asked), -1))
     )
 
 

@@ -39,6 +39,7 @@ CARD = "README.md"
 """What people complete by hand: a licence, whom to ask."""
 _STAMP = {"format": FORMAT, "made_by": "fdtasil"}
 _OURS_LIMIT = 2**24
+_FREE = {"max_queries", "versions", "device", "expert", "made", "opened", "reason"}
 _UNFINISHED_FILE = re.compile(r"\.[\w.]+\.\d+\.[0-9a-f]{8}\.tmp", re.ASCII)
 
 
@@ -110,11 +111,22 @@ def begun_over(folder: Path) -> bool:
 
     What is left of checkpoints may be the finished one's own.
     """
-    files = inside(folder, CONFIG), inside(folder, f"{CHECKPOINTS}/{CONFIG}")
-    if not all(file.exists() for file in files):
-        return False
-    now, left = (read_plain(file, _OURS_LIMIT, follow=False) for file in files)
-    return now != left
+    now, left = (_what_it_is(folder, name) for name in (CONFIG, f"{CHECKPOINTS}/{CONFIG}"))
+    return None not in (now, left) and now != left
+
+
+def _what_it_is(folder: Path, name: str) -> dict[str, Any] | None:
+    """Return a configuration without what may be another when a run goes on, or None."""
+    values = _values(folder, name)
+    return values and {k: v for k, v in values.items() if k not in _FREE}
+
+
+def _values(folder: Path, name: str) -> dict[str, Any] | None:
+    try:
+        values = from_json(read_plain(inside(folder, name), _OURS_LIMIT, follow=False))
+    except (OSError, ValueError):
+        return None
+    return values if isinstance(values, dict) else None
 
 
 def check_free(folder: Path) -> None:
@@ -142,11 +154,8 @@ def check_free(folder: Path) -> None:
 
 
 def _is_ours(folder: Path, name: str) -> bool:
-    try:
-        values = from_json(read_plain(inside(folder, name), _OURS_LIMIT, follow=False))
-    except (OSError, ValueError):
-        return False
-    if not isinstance(values, dict):
+    values = _values(folder, name)
+    if values is None:
         return False
     return values.get("made_by") == _STAMP["made_by"] or _is_of_the_time_before(values)
 

@@ -164,7 +164,9 @@ def _standing_still(
     """Let some states, (N,) bool, have probes that move nothing, which teach nothing new."""
     if not states.any():
         return answers
-    if around.actions is not None:
+    if around.probes.exact:  # along no direction nothing changes
+        said = np.zeros((int(states.sum()), answers.values.shape[-1]), np.float32)
+    elif around.actions is not None:
         said = around.actions[states]
     else:
         said = expert.ask(around.observations[states], "probe")

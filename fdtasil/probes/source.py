@@ -94,7 +94,7 @@ class Probes:
                 "a finite stencil with asked directions, and none with differentiated ones",
                 'write probes="jacobian" for the exact derivative',
             )
-        if self.exact or self._is_fixed:  # what is asked stays the same
+        if self.exact:  # a derivative stays the same
             object.__setattr__(self, "resample", False)
         if self.exact and self.has_labels:
             raise SettingError(
@@ -104,11 +104,6 @@ class Probes:
             )
         if self.per_step is not None and not _is_all(self.per_step):
             object.__setattr__(self, "per_step", check_count("per_step", self.per_step))
-
-    @property
-    def _is_fixed(self) -> bool:
-        """Whether every sample would be of the same points."""
-        return isinstance(self.directions, StandardBasis) and not isinstance(self.radius, tuple)
 
     @staticmethod
     def parse(spec: "int | str | Probes | None") -> "Probes | None":

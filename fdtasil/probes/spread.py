@@ -158,8 +158,13 @@ def stands_still(observations: np.ndarray, episode: np.ndarray) -> np.ndarray:
 
     Args:
         observations: (N, n) states.
-        episode: (N,) their episodes.
+        episode: (N,) their episodes; those of a single state say nothing.
     """
+    _, own, lengths = np.unique(episode, return_inverse=True, return_counts=True)
+    longer = lengths[own] > 1
+    observations, episode = observations[longer], episode[longer]
+    if not len(episode):
+        return np.zeros(observations.shape[1], bool)
     numbers = np.unique(episode)
     means = np.stack([observations[episode == e].mean(axis=0, dtype=np.float64) for e in numbers])
     between = means.std(axis=0)

@@ -31,6 +31,7 @@ _USUALLY = 0.75  # share of the expert's episodes that it survives
 _MISFIT = 0.15  # share of the actions' deviation; students of the experts here reach 0.01
 _RAISED = "; each row of a batch that raises is asked again, alone: a row of NaN costs no query"
 _CHOICES = 20  # values that a mode has at most
+_SELDOM = 0.05  # of the states: what is met in fewer is an exception
 _SHOWN = 8  # coordinates named in a warning
 _CLEARLY = 4  # of float32's steps, that rounding does not move a coordinate by
 _SMALL = 1e-4  # of the median deviation; robots' observations differ by less
@@ -191,11 +192,22 @@ def warn_of_still_coordinates(lesson: Lesson, expert: Episodes | None) -> None:
     )
 
 
+def _is_mode(values: np.ndarray) -> bool:
+    """Whether whole numbers are few, one beside the other, and two of them no exceptions.
+
+    Frames of a stack that is not full yet are zeros, and a force that is cut is seldom at its end.
+    """
+    if np.ptp(values) >= _CHOICES:
+        return False
+    kinds, counts = np.unique(values, return_counts=True)
+    return len(kinds) == np.ptp(values) + 1 and np.sort(counts)[-2] >= _SELDOM * len(values)
+
+
 def warn_of_whole_numbers(lesson: Lesson) -> None:
     """Warn of coordinates that may be a mode or a flag, of which no space has said so."""
     states, scales = lesson.dataset.demonstrations.observations, lesson.scales
     whole = (states == np.round(states)).all(axis=0) & scales.seen & scales.live & ~scales.told
-    found = [i for i in np.flatnonzero(whole) if len(np.unique(states[:, i])) <= _CHOICES]
+    found = [i for i in np.flatnonzero(whole) if _is_mode(states[:, i])]
     if len(states) > _CHOICES and found:
         listed = ", ".join(map(str, found[:_SHOWN])) + ", ..." * (len(found) > _SHOWN)
         warn(

@@ -86,9 +86,10 @@ def render(
     every, height = check_count("every", every), check_count("height", height, 32)
     bars = Progress(progress)
     with ExitStack() as open_, bars.bar("film", "picture", 1) as bar, simulator_warnings():
-        players = [
-            open_.enter_context(_Player(*pair, env, seed, horizon)) for pair in policies.items()
-        ]
+        players: list[_Player] = []
+        for name, policy in policies.items():
+            length = players[0].horizon if players else horizon  # what is wrong with it, once
+            players.append(open_.enter_context(_Player(name, policy, env, seed, length)))
         if len({id(player.simulator) for player in players}) < len(players):
             raise SettingError(
                 "a function that returns one and the same environment",

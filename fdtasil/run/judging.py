@@ -75,7 +75,8 @@ def warn_of_another_expert(policy: ExpertLike | Distilled, expert: Expert) -> No
     if before and now and before != now:
         warn(
             f"the student was distilled from {shown(policy.settings['expert'])} with the sha256 "
-            f"{before[:8]}..., and is judged by {expert.name} with {now[:8]}...: another expert"
+            f"{before[:8]}..., and is judged by {expert.name} with {now[:8]}...: another file, "
+            "and perhaps another expert"
         )
 
 

@@ -93,7 +93,7 @@ class Rounds:
             warn_of_falls(lesson.dataset.demonstrations, expert, self.run.keep)
         if last and self.run.can_spread:
             warn_of_still_coordinates(lesson, expert)
-            if self.run.spaces is None:
+            if self.run.spaces is None and self.run.probes and not self.run.probes.exact:
                 warn_of_whole_numbers(lesson)
 
     def _trained(self, round_: int, lesson: Lesson, before: Trained | None) -> Trained:

@@ -82,9 +82,10 @@ def _check_places(arguments: dict[str, Any]) -> None:
     Raises:
         SettingError: If there are some.
     """
-    if arguments["resume"] is not None and _flags(sys.argv) & {"--out"}:
+    out, resume = arguments["out"], arguments["resume"]
+    if resume is not None and "--out" in _flags(sys.argv) and out.absolute() != resume.absolute():
         raise SettingError(
-            f"--out beside --resume {arguments['resume']}",
+            f"--out {out} beside --resume {resume}",
             "one folder: a run ends where it began",
             "leave --out out",
         )
