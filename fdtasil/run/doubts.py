@@ -197,7 +197,7 @@ def _is_mode(values: np.ndarray) -> bool:
 
     Frames of a stack that is not full yet are zeros, and a force that is cut is seldom at its end.
     """
-    if np.ptp(values) >= _CHOICES:
+    if not 0 < np.ptp(values) < _CHOICES:
         return False
     kinds, counts = np.unique(values, return_counts=True)
     return len(kinds) == np.ptp(values) + 1 and np.sort(counts)[-2] >= _SELDOM * len(values)
