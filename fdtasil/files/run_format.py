@@ -18,6 +18,7 @@ __all__ = [
     "CHECKPOINTS",
     "COMMAND",
     "CONFIG",
+    "FREE",
     "MODEL",
     "PROGRESS",
     "REPORT",
@@ -39,7 +40,10 @@ CARD = "README.md"
 """What people complete by hand: a licence, whom to ask."""
 _STAMP = {"format": FORMAT, "made_by": "fdtasil"}
 _OURS_LIMIT = 2**24
-_FREE = {"max_queries", "versions", "device", "expert", "made", "opened", "reason"}
+FREE = ("max_queries", "reason", "made", "opened")
+"""Parts of a configuration that may be others when a run goes on: what it may ask changes none of
+its bytes, and words say what a fingerprint, and the expert's own answers, tell."""
+_SURROUNDINGS = ("versions", "device", "expert")  # which may be others too, with a warning
 _UNFINISHED_FILE = re.compile(r"\.[\w.]+\.\d+\.[0-9a-f]{8}\.tmp", re.ASCII)
 
 
@@ -118,7 +122,7 @@ def begun_over(folder: Path) -> bool:
 def _what_it_is(folder: Path, name: str) -> dict[str, Any] | None:
     """Return a configuration without what may be another when a run goes on, or None."""
     values = _values(folder, name)
-    return values and {k: v for k, v in values.items() if k not in _FREE}
+    return values and {k: v for k, v in values.items() if k not in (*FREE, *_SURROUNDINGS)}
 
 
 def _values(folder: Path, name: str) -> dict[str, Any] | None:

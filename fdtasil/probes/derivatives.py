@@ -8,7 +8,7 @@ import torch
 from fdtasil.errors import ExpertError, in_one_line
 from fdtasil.experts.expert import Expert
 from fdtasil.probes.gains import gain_rows, gains
-from fdtasil.probes.scales import ROUNDING, measure_scales
+from fdtasil.probes.scales import least_steps, measure_scales
 
 __all__ = ["check_derivatives", "comparison_rows", "differentiate"]
 
@@ -165,8 +165,7 @@ def check_derivatives(expert: Expert, observations: np.ndarray) -> None:
         return
     chosen = np.linspace(0, len(observations) - 1, _COMPARED).astype(int)
     rows = observations[chosen]
-    least = ROUNDING * np.abs(rows).max(axis=0)  # smaller steps are rounded away
-    scale = np.maximum(measure_scales(observations).units, least)
+    scale = np.maximum(measure_scales(observations).units, least_steps(rows))
     given, found = _jacobians(expert, rows), gains(expert, rows, scale=scale)
     expert.count(found.queries, "probe")
     apart = np.sqrt(np.nanmean(((given - found.jacobian) * scale) ** 2, axis=0))

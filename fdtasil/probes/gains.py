@@ -8,7 +8,7 @@ from fdtasil.checks import check_count, spelt
 from fdtasil.errors import SettingError
 from fdtasil.experts.expert import Expert
 from fdtasil.experts.load import ExpertLike, load_expert
-from fdtasil.probes.scales import ROUNDING, measure_scales
+from fdtasil.probes.scales import least_steps, measure_scales
 
 __all__ = ["Gains", "gain_rows", "gains"]
 
@@ -174,7 +174,7 @@ def _still(rows: np.ndarray) -> tuple[int, ...]:
 
 
 def _units(rows: np.ndarray, scale: np.ndarray | None) -> np.ndarray:
-    least = ROUNDING * np.abs(rows).max(axis=0)  # smaller steps are rounded away
+    least = least_steps(rows)
     if scale is None:
         return np.maximum(measure_scales(rows).units, least)
     units = np.asarray(scale, np.float64)

@@ -7,7 +7,14 @@ import numpy as np
 
 from fdtasil.errors import SettingError
 
-__all__ = ["ROUNDING", "Scales", "action_units", "measure_actions", "measure_scales"]
+__all__ = [
+    "ROUNDING",
+    "Scales",
+    "action_units",
+    "least_steps",
+    "measure_actions",
+    "measure_scales",
+]
 
 # A coordinate whose deviation is below this share of the median one does not move: what is left
 # is rounding (Humanoid has one of 1.8e-14), and dividing by it would blow up the first bump.
@@ -80,13 +87,18 @@ def measure_scales(observations: np.ndarray, seen: np.ndarray | None = None) -> 
     """
     wide = observations.astype(np.float64)
     mean, deviation = wide.mean(axis=0), wide.std(axis=0)
-    moving = deviation > ROUNDING * np.abs(wide).max(axis=0)
+    moving = deviation > least_steps(wide)
     if not moving.any():  # a single state tells nothing of scales: raw units
         moving, deviation = np.ones_like(moving), np.ones_like(deviation)
     live = moving & (deviation > _STILL * np.median(deviation[moving]))
     scale = np.where(live, deviation, 1.0)
     visible = np.ones_like(live) if seen is None else seen
     return Scales(mean, scale, deviation, live, visible, np.zeros_like(live))
+
+
+def least_steps(rows: np.ndarray) -> np.ndarray:
+    """Return (n,) the steps from (N, n) observations below which float32 rounds them away."""
+    return ROUNDING * np.abs(rows).max(axis=0)
 
 
 def measure_actions(actions: np.ndarray, choices: Iterable[tuple[int, int]] = ()) -> Scales:

@@ -8,7 +8,7 @@ import numpy as np
 
 from fdtasil.checks import check_count, check_number, spelt
 from fdtasil.errors import SettingError
-from fdtasil.probes.scales import ROUNDING
+from fdtasil.probes.scales import least_steps
 from fdtasil.rollouts.naming import columns_named
 from fdtasil.rollouts.spaces import Layout
 
@@ -168,7 +168,7 @@ def stands_still(observations: np.ndarray, episode: np.ndarray) -> np.ndarray:
     numbers = np.unique(episode)
     means = np.stack([observations[episode == e].mean(axis=0, dtype=np.float64) for e in numbers])
     between = means.std(axis=0)
-    differs = between > ROUNDING * np.abs(means).max(axis=0)
+    differs = between > least_steps(means)
     return differs & (_widest_within(observations, episode) <= _STILL * between)
 
 

@@ -16,6 +16,7 @@ from fdtasil.files.reading import read_plain
 from fdtasil.files.run_format import (
     CHECKPOINTS,
     CONFIG,
+    FREE,
     begun_over,
     check_free,
     stamped,
@@ -39,10 +40,6 @@ CHECKPOINT_SECONDS = 20.0
 
 _CONFIG_LIMIT = 2**24
 _FINGERPRINT = "fingerprint"
-# In words: a fingerprint, and the expert's own answers, tell whether they are the same.
-_MADE, _OPENED = "made", "opened"
-_FREE = "max_queries"  # what a run is allowed to ask changes none of its bytes
-_REASON = "reason"  # follows from what may be another
 
 
 @contextmanager
@@ -218,7 +215,7 @@ def _read_config(path: Path) -> dict[str, Any]:
 def _check_same(
     before: dict[str, Any], now: dict[str, Any], path: Path, *, finished: bool
 ) -> None:
-    left_out: dict[str, None] = dict.fromkeys((_FREE, _REASON, _FINGERPRINT, _MADE, _OPENED))
+    left_out: dict[str, None] = dict.fromkeys((*FREE, _FINGERPRINT))
     if before.get("expert_sha256") is not None and before["expert_sha256"] == now["expert_sha256"]:
         left_out["expert"] = None  # the same file, wherever it lies now
     changed = _differences({**before, **left_out}, {**now, **left_out})

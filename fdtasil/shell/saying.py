@@ -43,12 +43,12 @@ def json_file(path: Path | None) -> Path | None:
 
 def say(found: Found, file: Path | None) -> None:
     """Write what was found, where there is a file from `json_file`, and print it."""
+    if file is None:
+        print(found)
+        return
     text = json.dumps(without_infinities(found.to_json())[0], indent=2)
     if file == _PRINTED:
         print(text)
         return
-    if file is not None:  # first: who reads the print may stop to
-        write_bytes(file, text.encode())
-    print(found)
-    if file is not None:
-        print(f"written: {file}")
+    write_bytes(file, text.encode())  # first: who reads the print may stop to
+    print(f"{found}\nwritten: {file}")
