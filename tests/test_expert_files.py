@@ -156,7 +156,7 @@ def test_the_hash_holds_the_side_files_of_every_tensor(place, tmp_path):
     after = fdtasil.load_expert(path)
     states = np.zeros((1, 5), np.float32)
     assert (after.ask(states, "act") - before.ask(states, "act")).ravel().tolist() == [0, 0.25]
-    assert after.sha256 != before.sha256
+    assert after.origin.sha256 != before.origin.sha256
 
 
 # --- side files

@@ -517,8 +517,10 @@ def test_an_option_that_nothing_is_made_of_is_refused(source, option, said):
 
 
 def test_a_trust_that_nothing_was_opened_with_is_not_recorded(tmp_path):
-    assert fdtasil.load_expert(mlp_onnx(tmp_path / "e.onnx"), trust="pickle").opened is None
-    assert fdtasil.load_expert(mlp_onnx(tmp_path / "e.onnx"), output="actions").opened
+    assert (
+        fdtasil.load_expert(mlp_onnx(tmp_path / "e.onnx"), trust="pickle").origin.options is None
+    )
+    assert fdtasil.load_expert(mlp_onnx(tmp_path / "e.onnx"), output="actions").origin.options
 
 
 def test_a_predict_that_is_no_function():

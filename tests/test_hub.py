@@ -120,7 +120,7 @@ def test_every_revision_is_pinned(revision, large, hub, tmp_path, rows):
     expert = load_expert(uri, 5, 2)
     assert expert.name == f"{WALKER}@{sha}"
     local = load_expert(tmp_path / "walker.onnx", 5, 2)
-    assert expert.sha256 == local.sha256
+    assert expert.origin.sha256 == local.origin.sha256
     assert np.array_equal(expert.ask(rows, "check"), local.ask(rows, "check"))
     assert not any("code.py" in path for path in hub.asked())
 
@@ -140,18 +140,18 @@ def test_a_branch_that_moves_is_followed_and_a_commit_is_not(hub, tmp_path, rows
     after = load_expert(WALKER)
     assert after.name != before.name
     assert not np.array_equal(after.ask(rows, "check"), before.ask(rows, "check"))
-    assert load_expert(before.name).sha256 == before.sha256
+    assert load_expert(before.name).origin.sha256 == before.origin.sha256
 
 
 def test_a_pinned_file_that_was_fetched_needs_no_network(hub, tmp_path):
     hub.repositories["org/repo"].commit(side_by_side(tmp_path, "deep/model.onnx"))
     first = load_expert("hf://org/repo/deep/model.onnx")
     asked = len(hub.requests)
-    assert load_expert(first.name).sha256 == first.sha256
+    assert load_expert(first.name).origin.sha256 == first.origin.sha256
     assert len(hub.requests) == asked
     hub.close()
     huggingface_hub.close_session()  # a connection that is kept alive would still be served
-    assert load_expert(first.name).sha256 == first.sha256
+    assert load_expert(first.name).origin.sha256 == first.origin.sha256
     assert "can't be used: ConnectError" in refused("hf://org/repo/deep/model.onnx")
 
 
@@ -161,7 +161,7 @@ def test_an_agent_in_a_zip(hub, tmp_path):
     expert, local = load_expert(uri), load_expert(tmp_path / "sac.zip")
     states = np.zeros((3, 3), np.float32)
     assert expert.name == f"{uri}@{newest(hub)}"
-    assert expert.sha256 == local.sha256
+    assert expert.origin.sha256 == local.origin.sha256
     assert np.array_equal(expert.ask(states, "check"), local.ask(states, "check"))
 
 

@@ -107,7 +107,7 @@ def test_other_kinds_go_to_processes_too(kind, tmp_path, rows):
     alone = fdtasil.load_expert(sources[kind], 5, 2, batch=8)
     together = fdtasil.load_expert(sources[kind], 5, 2, workers=1)
     assert np.array_equal(alone.ask(rows, "act"), together.ask(rows, "act"))
-    assert together.sha256 == alone.sha256
+    assert together.origin.sha256 == alone.origin.sha256
 
 
 def test_a_worker_computes_on_one_thread_and_loads_what_the_expert_needs(rows):

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 
 from fdtasil.errors import ExpertError, ExportError
-from fdtasil.experts.expert import Expert, Hints
+from fdtasil.experts.expert import Expert, Hints, Origin
 from fdtasil.files.compiled import shared_function
 from fdtasil.files.reading import read_limited
 from fdtasil.files.storage import sha256
@@ -47,7 +47,7 @@ def open_c(source: str | Path, hints: Hints) -> Expert:
     except ExportError as error:
         raise ExpertError(f"{source}: {error.found}", error.expected, error.next_step) from error
     digest = sha256(text.encode())
-    return Expert(policy, Path(source).name, n, m, digest, source=str(source))
+    return Expert(policy, Path(source).name, n, m, origin=Origin(str(source), digest))
 
 
 class _Compiled:

@@ -61,8 +61,8 @@ def multiply_adds(expert: Expert, observation_size: int) -> int | None:
     """
     if expert.workers is not None or expert.chunk < _FEW:
         return None
-    if expert.multiply_adds is not None or expert.module is None:
-        return expert.multiply_adds
+    if expert.origin.multiply_adds is not None or expert.module is None:
+        return expert.origin.multiply_adds
     return _counted(expert.module, observation_size)
 
 

@@ -16,7 +16,7 @@ from fdtasil.checks import check_choice, check_count, check_flag, check_path, sp
 from fdtasil.compute import usual_modes
 from fdtasil.errors import ExpertError, FdtasilWarning, SettingError, in_one_line
 from fdtasil.experts.c_expert import open_c
-from fdtasil.experts.expert import CHUNK, Expert, Hints
+from fdtasil.experts.expert import CHUNK, Expert, Hints, Origin
 from fdtasil.experts.http_expert import is_http_url, open_http
 from fdtasil.experts.hub import fetch, is_hub_uri
 from fdtasil.experts.memory import Memory, stateless
@@ -193,7 +193,12 @@ def open_expert(source: ExpertLike, hints: Hints) -> Expert:
     with usual_modes():
         found = kind.opens(source, hints)
     said = [f"{name}={value!r}" for name, value in told.items() if name in kind.takes]
-    return dataclasses.replace(found, opened=in_one_line(", ".join(said))) if said else found
+    return _from(found, options=in_one_line(", ".join(said))) if said else found
+
+
+def _from(expert: Expert, **told: str) -> Expert:
+    """Return an expert of which more is told where it came from."""
+    return dataclasses.replace(expert, origin=dataclasses.replace(expert.origin, **told))
 
 
 _TAKEN_BY = {
@@ -246,7 +251,7 @@ def _opener(source: ExpertLike, expert: Expert, hints: Hints) -> Callable[[], Po
     known = dataclasses.replace(
         hints, observation_size=expert.observation_size, action_size=expert.action_size
     )
-    return partial(_open_again, file, known, expert.sha256)
+    return partial(_open_again, file, known, expert.origin.sha256)
 
 
 def _open_again(file: str | Path, hints: Hints, sha256: str | None) -> Policy:
@@ -254,7 +259,7 @@ def _open_again(file: str | Path, hints: Hints, sha256: str | None) -> Policy:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore", FdtasilWarning)  # the caller has been told
         expert = open_expert(file, hints)
-    if expert.sha256 != sha256:
+    if expert.origin.sha256 != sha256:
         raise ExpertError(
             f"{file} has changed since it was opened",
             f"sha256 {sha256}",
@@ -279,11 +284,13 @@ def _from_hub(uri: str | Path, hints: Hints) -> Expert:
             "download the file, look at it, and name its path",
         )
     file = fetch(uri)
-    return dataclasses.replace(open_expert(file.path, hints), name=file.uri, source=file.uri)
+    found = dataclasses.replace(open_expert(file.path, hints), name=file.uri)
+    return _from(found, source=file.uri)
 
 
 def _from_agent(path: str | Path, hints: Hints) -> Expert:
     agent = read_agent(path, trust=None if hints.trust == "c" else hints.trust)
+    origin = Origin(str(path), agent.sha256)
     if isinstance(agent.module, RecurrentNetwork):
         n, step = agent.observation_size, agent.module.step
         return Expert(
@@ -291,17 +298,15 @@ def _from_agent(path: str | Path, hints: Hints) -> Expert:
             Path(path).name,
             n + agent.memory,
             len(agent.action_low),
-            agent.sha256,
-            source=str(path),
             memory=Memory(agent.memory, step),
+            origin=origin,
         )
     return dataclasses.replace(
         ask_as_it_is(agent.module),
         name=Path(path).name,
         observation_size=agent.observation_size,
         action_size=len(agent.action_low),
-        sha256=agent.sha256,
-        source=str(path),
+        origin=origin,
     )
 
 

@@ -13,7 +13,7 @@ from torch.nn import Module
 
 from fdtasil.errors import ExpertError, FdtasilError, SettingError, shown
 from fdtasil.experts.cost import stored_numbers
-from fdtasil.experts.expert import Expert, Hints
+from fdtasil.experts.expert import Expert, Hints, Origin
 from fdtasil.experts.memory import Memory, stateless
 from fdtasil.experts.sizes import size_hint
 from fdtasil.experts.trial import try_out
@@ -87,8 +87,8 @@ def open_onnx(source: str | Path, hints: Hints) -> Expert:
     twin = _twin(model, policy, n, path)
     # One that takes a row at a time costs as much as a slow one, however small it is.
     work = None if policy.one_by_one else stored_numbers(model)
-    about = {"source": str(source), "columns": columns, "multiply_adds": work}
-    return Expert(policy, path.name, n, m, digest, twin, **about)
+    origin = Origin(str(source), digest, columns, work)
+    return Expert(policy, path.name, n, m, twin, origin=origin)
 
 
 def _recurrent(
@@ -120,9 +120,8 @@ def _recurrent(
         Path(source).name,
         n + k,
         policy.action_size,
-        digest,
-        source=name,
         memory=Memory(k, policy),
+        origin=Origin(name, digest),
     )
 
 

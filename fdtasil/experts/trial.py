@@ -9,7 +9,7 @@ import pickle
 from collections.abc import Callable
 
 from fdtasil.errors import ExpertError, shown
-from fdtasil.experts.expert import RaisedElsewhere
+from fdtasil.experts.batches import RaisedElsewhere
 from fdtasil.experts.workers.handle import Ended, in_a_process
 from fdtasil.files.onnx.limits import MEMORY
 

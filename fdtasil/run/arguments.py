@@ -147,8 +147,8 @@ class Arguments:
         horizon = resolve_horizon(self.horizon, subject.pool) if subject.pool else 0
         (start,) = episode_seeds(self.seed, "evaluation", 0, 1)
         return Configuration(
-            expert=(expert.source or expert.name) if expert else None,
-            expert_sha256=expert.sha256 if expert else None,
+            expert=(expert.origin.source or expert.name) if expert else None,
+            expert_sha256=expert.origin.sha256 if expert else None,
             env=subject.environment,
             trainer=self.trainer,
             dataset=sha256(given.to_bytes()) if given else None,
@@ -177,7 +177,7 @@ class Arguments:
             reason=None,
             spaces=subject.spaces,
             made=subject.pool.made if subject.pool else None,
-            opened=expert.opened if expert else None,
+            opened=expert.origin.options if expert else None,
         )
 
     def _spread(self, subject: Subject) -> Spread:

@@ -244,7 +244,7 @@ def _policy_in(policy: ExpertLike | Distilled, pool: EnvironmentPool, seed: int)
     n, m = pool.boxes.observation_size, pool.boxes.action_size
     whole = student_obs is None and history == 1
     judged = judged_in(looked_at, pool, view_size(student_obs, n), whole=whole)
-    if student_obs is None and judged.columns is None:
+    if student_obs is None and judged.origin.columns is None:
         opened, _, _ = carry(sized(judged, n, m), pool)
         return opened.policy("evaluate")
     return acting(judged, student_obs, first_observations(pool, [seed]), m)

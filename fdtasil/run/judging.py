@@ -71,7 +71,7 @@ def warn_of_another_expert(policy: ExpertLike | Distilled, expert: Expert) -> No
     """Warn where a run's student is judged by another file than it was distilled from."""
     if not isinstance(policy, Distilled):
         return
-    before, now = policy.settings.get("expert_sha256"), expert.sha256
+    before, now = policy.settings.get("expert_sha256"), expert.origin.sha256
     if before and now and before != now:
         warn(
             f"the student was distilled from {shown(policy.settings['expert'])} with the sha256 "
@@ -118,7 +118,7 @@ def judged_in(
     if isinstance(policy, Student):
         own = {"observation_size": policy.observation_size, "action_size": policy.action_size}
         judged = replace(judged, **own)
-    if spaces is not None and (not whole or judged.columns is not None):
+    if spaces is not None and (not whole or judged.origin.columns is not None):
         spaces = Spaces(flat_layout(size or 1), spaces.actions)
     return in_spaces(judged, spaces)
 
@@ -142,7 +142,7 @@ def acting(
         remembered: Of n, how many numbers are the memory of the expert beside it.
         purpose: That its rows are counted under.
     """
-    seen = judged.columns if student_obs is None else student_obs
+    seen = judged.origin.columns if student_obs is None else student_obs
     view = View.of(visible(seen, states.shape[1], remembered), states[:256])
     return view.policy(sized(judged, view.size, action_size).policy(purpose))
 

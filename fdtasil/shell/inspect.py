@@ -93,7 +93,7 @@ def _contract(looked: Looked, pool: EnvironmentPool) -> list[tuple[str, object]]
         ("actions", _actions(pool)),
     ]
     if expert is not None:
-        rows.insert(0, ("sha256", expert.sha256))
+        rows.insert(0, ("sha256", expert.origin.sha256))
         rows += [("analytic", "a torch twin agrees with it" if expert.module else "not available")]
     return rows + [
         (finding.name, f"{'FAILED: ' if finding.problem else ''}{finding.measured}")

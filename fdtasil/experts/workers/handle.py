@@ -14,7 +14,7 @@ import numpy as np
 
 from fdtasil.errors import ExpertError
 from fdtasil.experts import worker_process
-from fdtasil.experts.expert import RaisedElsewhere
+from fdtasil.experts.batches import RaisedElsewhere
 
 __all__ = ["Ended", "WorkerProcess", "in_a_process"]
 

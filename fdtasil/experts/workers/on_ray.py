@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 
 from fdtasil.errors import ExpertError, SettingError, first_line, warn
-from fdtasil.experts.expert import Expert, RaisedElsewhere
+from fdtasil.experts.batches import RaisedElsewhere
+from fdtasil.experts.expert import Expert
 from fdtasil.experts.workers.pool import WorkerGroup
 
 __all__ = ["with_ray"]
