@@ -13,8 +13,8 @@ from conftest import GAIN, QUICK, TOY, mlp_onnx
 
 import fdtasil
 from fdtasil.errors import ExpertError, FdtasilWarning, SettingError
+from fdtasil.results.shrunk import Candidate
 from fdtasil.run.elsewhere import side_by_side
-from fdtasil.run.shrinking import Candidate
 
 pytestmark = pytest.mark.usefixtures("no_pictures")
 SIZES = [(2,), (16, 16)]

@@ -54,7 +54,7 @@ def draw_sizes(candidates: Sequence[Any], keep: float) -> bytes:
     """Draw return against bytes of students of several sizes, as a PNG.
 
     Args:
-        candidates: As `fdtasil.run.shrinking.Candidate`.
+        candidates: As `fdtasil.results.shrunk.Candidate`.
         keep: Share of the expert's return that is to be kept.
     """
     figure = _figure(6.0, 3.4)

@@ -3,23 +3,22 @@
 import os
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, closing
+from contextlib import ExitStack
 from dataclasses import replace
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
-from PIL import Image, ImageDraw, ImageFont
 
 from fdtasil.checks import check_count, check_path, check_suffix
-from fdtasil.errors import EnvironmentFault, ExportError, SettingError, first_line
+from fdtasil.errors import EnvironmentFault, SettingError, first_line
 from fdtasil.experts.carrying import carry
 from fdtasil.experts.load import ExpertLike, sized
 from fdtasil.files.storage import write_bytes
 from fdtasil.progress import Progress
 from fdtasil.results.distilled import Distilled
+from fdtasil.results.moving_pictures import WRITERS, panel
 from fdtasil.rollouts.behaviours import Policy, follow_answers
 from fdtasil.rollouts.environments import (
     EnvironmentLike,
@@ -38,10 +37,7 @@ from fdtasil.student.view import view_size
 
 __all__ = ["choose_renderer", "render"]
 
-_BAR, _MARGIN = 40, 8  # pixels above a picture, and around its text
-_INK, _PAPER, _FADED = (20, 20, 20), (255, 255, 255), 0.45
 _FPS = 30  # where the environment does not say
-_LAST = 1.0  # seconds that the last picture stands
 
 
 def render(
@@ -78,7 +74,7 @@ def render(
 
         fdtasil.render({"expert": "expert.onnx", "student": "student.onnx"}, "Ant-v5", "film.mp4")
     """
-    path = check_suffix(check_path("out", out), *_WRITERS).absolute()
+    path = check_suffix(check_path("out", out), *WRITERS).absolute()
     if not isinstance(policies, Mapping) or not policies:
         found = f"policies is a {type(policies).__name__}" if policies else "no policies"
         raise SettingError(found, "names with policies", 'write {"student": student}')
@@ -100,7 +96,7 @@ def render(
         bar.lengthen(len(range(0, steps, every)))
         pictures = _pictures(players, steps, every, height, bar.move)
         fps = players[0].fps / every
-        write_bytes(path, _WRITERS[path.suffix.lower()](pictures, fps))
+        write_bytes(path, WRITERS[path.suffix.lower()](pictures, fps))
     return Path(out)
 
 
@@ -270,87 +266,5 @@ def _pictures(
 
 
 def _panel(player: _Player, height: int) -> np.ndarray:
-    """Return a picture with a name and a return above it; both sides even, as codecs want it."""
-    picture = player.draw()
-    height -= height % 2
-    width = 2 * round(height * picture.shape[1] / picture.shape[0] / 2)
-    shown = Image.fromarray(picture).resize((width, height), Image.Resampling.LANCZOS)
-    if player.over:
-        shown = Image.blend(shown, Image.new("RGB", shown.size, _PAPER), _FADED)
-    panel = Image.new("RGB", (width, height + _BAR), _PAPER)
-    panel.paste(shown, (0, _BAR))
-    pen, font = ImageDraw.Draw(panel), ImageFont.load_default(15)
-    pen.text((_MARGIN, _MARGIN), player.name, _INK, font)
     told = f"{player.total:,.0f}" + f", ended at step {player.step}" * player.over
-    pen.text((width - _MARGIN, _MARGIN), told, _INK, font, anchor="ra")
-    return np.asarray(panel)
-
-
-def _mp4(pictures: Iterator[np.ndarray], fps: float) -> bytes:
-    try:
-        import imageio_ffmpeg
-    except ImportError as error:
-        raise ExportError(
-            "an .mp4 without the package imageio-ffmpeg", "it", 'pip install "fdtasil[video]"'
-        ) from error
-    from tempfile import TemporaryDirectory
-
-    first = next(pictures)
-    with TemporaryDirectory() as folder:
-        file = Path(folder, "film.mp4")
-        writer = imageio_ffmpeg.write_frames(
-            str(file),
-            (first.shape[1], first.shape[0]),
-            fps=fps,  # pyright: ignore[reportArgumentType]
-            macro_block_size=2,
-            quality=7,
-        )
-        with closing(writer):
-            writer.send(None)
-            last = first
-            writer.send(np.ascontiguousarray(first))
-            for last in pictures:
-                writer.send(np.ascontiguousarray(last))
-            for _ in range(round(_LAST * fps)):
-                writer.send(np.ascontiguousarray(last))
-        return file.read_bytes()
-
-
-def _still(
-    kind: str, grain: int, least: int, **options: Any
-) -> Callable[[Iterator[np.ndarray], float], bytes]:
-    """Return what writes a format of pictures that move.
-
-    Args:
-        kind: What Pillow calls it.
-        grain: Milliseconds that it counts in.
-        least: Milliseconds that viewers show a picture for at least.
-        **options: Of Pillow.
-    """
-
-    def write(pictures: Iterator[np.ndarray], fps: float) -> bytes:
-        kept, times = [], []
-        last = None
-        for number, last in enumerate(pictures):
-            time = grain * round(1000 * number / fps / grain)
-            if not times or time - times[-1] >= least:
-                kept.append(Image.fromarray(last))
-                times.append(time)
-        if last is not None:  # how it ends is seen, whatever is left out
-            kept[-1] = Image.fromarray(last)
-        first, *rest = kept
-        durations = [*np.diff(times).tolist(), round(1000 * _LAST)]
-        target = BytesIO()
-        about = {"save_all": True, "append_images": rest, "duration": durations, "loop": 0}
-        first.save(target, kind, **about, **options)
-        return target.getvalue()
-
-    return write
-
-
-_WRITERS: dict[str, Callable[[Iterator[np.ndarray], float], bytes]] = {
-    ".mp4": _mp4,
-    ".webp": _still("WEBP", 1, 1, quality=60, method=4),
-    ".gif": _still("GIF", 10, 20, optimize=True),  # many take a shorter time for 100
-}
-"""Every format by the suffix of its file."""
+    return panel(player.draw(), height, player.name, told, faded=player.over)
