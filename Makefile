@@ -23,7 +23,7 @@ film: .venv/ready
 test: .venv/ready
 	$(BIN)/python -m pytest -q -n 2 -m "not slow"
 
-# Everything, in under an hour, and a table of what was survived.
+# Everything, in about an hour, and a table of what was survived.
 torture: .venv/ready
 	$(BIN)/python -m pytest -q -n 2 --figures
 

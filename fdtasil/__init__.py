@@ -9,6 +9,7 @@
 The rooms, on the way of the data; a room imports only those above it and the ground:
 
     rollouts        who acts in an environment, and what is recorded
+    files           the only room that reads and writes files; on one floor with rollouts
     experts         who is asked
     probes          where else the expert is asked
     demonstrations  what is learnt from
@@ -17,7 +18,7 @@ The rooms, on the way of the data; a room imports only those above it and the gr
     run             the loop
     shell           the commands
 
-On the ground: files, checks, seeding, compute, progress, errors, version. `fdtasil.testing` has
+On the ground: checks, seeding, compute, progress, errors, version. `fdtasil.testing` has
 checks for experts and students of one's own.
 """
 

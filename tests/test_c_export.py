@@ -1,14 +1,16 @@
 """A student as C and in numpy: the same answers, and nothing that a board does not have."""
 
+import os
 import pickle
 import shutil
 import subprocess
+import sys
 
 import gymnasium
 import numpy as np
 import pytest
 import torch
-from conftest import QUICK, TOY, mlp_onnx
+from conftest import GAIN, QUICK, TOY, mlp_onnx
 from test_student import make
 
 import fdtasil
@@ -385,3 +387,56 @@ def test_a_student_of_a_function_says_so(linear, tmp_path):
     result = fdtasil.distill(linear, TOY, 0, student_obs=polar, **QUICK)
     result.export(tmp_path / "student.h")
     assert "what the function polar makes of" in (tmp_path / "student.h").read_text()
+
+
+@pytest.mark.fault(321)
+def test_the_order_of_many_parts_is_told_whole(tmp_path):
+    names = [f"sensor_group_{number:02}" for number in range(14)]
+    box = gymnasium.spaces.Box(-1, 1, (3,), np.float32)
+    seen = layout_of(gymnasium.spaces.Dict(dict.fromkeys(names, box)), "observations")
+    done = layout_of(gymnasium.spaces.Box(-1, 1, (1,), np.float32), "actions")
+    student = fdtasil.Student(
+        fdtasil.Mlp(4), np.zeros(42), np.ones(42), -np.ones(1), np.ones(1), torch.Generator(),
+        spaces=Spaces(seen, done),
+    )  # fmt: skip
+    states = np.zeros((2, 42), np.float32)
+    for name in ("s.h", "s.py", *(["s.c"] if compiler() else [])):
+        text = export(student, states, {}, name).decode()
+        assert all(name in text for name in names)
+        assert max(map(len, text.split("*/")[0].splitlines())) < 110 or name == "s.py"
+
+
+@needs_a_compiler
+@pytest.mark.fault(321)
+def test_letters_beyond_ascii_are_written_in_every_locale(tmp_path):
+    code = (
+        "from fdtasil.files.compiled import answers_of\n"
+        "source = '/* \\u03b8 */ int main(void) { return 0; }'\n"
+        "print(len(answers_of(source, [[0.0]] * 0, 'X')))"
+    )
+    odd = {"PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0", "LC_ALL": "C"}
+    command = [sys.executable, "-c", code]
+    done = subprocess.run(command, env={**os.environ, **odd}, capture_output=True, text=True)
+    assert "UnicodeEncodeError" not in done.stderr, done.stderr
+
+
+@pytest.mark.fault(321)
+@pytest.mark.parametrize("name", ["s.int8.py", "s.int8.h", "s.int8.safetensors", "s.int8.tflite"])
+def test_eight_bits_are_refused_where_there_are_none(name, quick):
+    with pytest.raises(SettingError, match="a name that ends with"):
+        quick.export_bytes(name)
+
+
+@needs_a_compiler
+@pytest.mark.fault(326)
+def test_a_file_that_says_what_it_sees_is_judged_by_that(tmp_path):
+    law = lambda rows: np.asarray(rows, np.float32) @ GAIN.T  # noqa: E731
+    result = fdtasil.distill(law, TOY, 0, student_obs=[3, 0, 2, 1, 4], **QUICK)
+    about = {"episodes": 2, "horizon": 20}
+    for name in ("s.c", "s.onnx"):
+        path = result.export(tmp_path / name)
+        policy = fdtasil.load_expert(str(path), trust="c") if name == "s.c" else path
+        found = fdtasil.evaluate(policy, law, TOY, **about)
+        assert found.action_error == pytest.approx(result.evaluation.action_error, abs=1e-4)
+        with pytest.raises(SettingError, match="as the file says itself"):
+            fdtasil.evaluate(policy, law, TOY, student_obs=[0, 1, 2, 3, 4], **about)

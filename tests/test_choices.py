@@ -380,3 +380,27 @@ def test_recorded_scores_are_centred_as_an_experts_are():
     assert np.array_equal(kept.demonstrations.actions, centred.demonstrations.actions)
     again = fdtasil.distill(lookup, made, dataset=result.dataset, progress=False, **run)
     assert np.array_equal(again.demonstrations.actions, result.demonstrations.actions)
+
+
+@pytest.mark.fault(320)
+@pytest.mark.parametrize("done", ["choice", "choices"])
+def test_a_student_of_choices_is_as_far_off_however_it_is_judged(done, tmp_path):
+    """A number added to all scores changes no choice, and no error."""
+    made = lambda: InForm("box", done)  # noqa: E731
+    expert = in_form(law, "box", done)
+    result = fdtasil.distill(expert, made, 0, **QUICK)
+    about = {"episodes": 2, "horizon": 20}
+    for policy in (result, result.export(tmp_path / "s.onnx")):
+        found = fdtasil.evaluate(policy, expert, made, **about)
+        assert found.action_error == pytest.approx(result.evaluation.action_error, rel=1e-3)
+
+
+@pytest.mark.fault(324)
+def test_nothing_is_chosen_of_an_observation_that_is_none(tmp_path):
+    result = distilled(in_form(law, "box", "choice"), probes=0)
+    nothing = np.full(5, np.nan, np.float32)
+    with pytest.raises(SettingError, match="NaN or infinite"):
+        result.student.predict(nothing)
+    plain = PlainPolicy.load(result.save(tmp_path / "run") / "student.safetensors")
+    with pytest.raises(ValueError, match="NaN"):
+        plain.choose(nothing)

@@ -155,6 +155,20 @@ def test_a_curved_function_needs_the_forward_stencil(linear):
         fdtasil.distill(linear, TOY, "sphere:3,central", student_obs=curved, **QUICK)
 
 
+@pytest.mark.fault(319)
+@pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
+def test_a_function_is_curved_in_every_unit(unit):
+    states = np.random.default_rng(0).uniform(0.1, 1, (50, 2)).astype(np.float32)
+    numbers = np.tile(np.array([0, 1], np.int32), (50, 1))
+    moved, values = np.eye(2, dtype=np.float32), np.zeros((50, 2, 2, 1))
+    around = Answers(moved, numbers, values, np.ones(2))
+    line = View.of(lambda rows: unit * (rows[:, :1] + rows[:, 1:]), states)
+    line.answers(around, states, (1.0, -1.0))
+    curve = View.of(lambda rows: unit * rows**2, states)
+    with pytest.raises(SettingError, match="a curved function"):
+        curve.answers(around, states, (1.0, -1.0))
+
+
 @pytest.mark.parametrize(
     "wrong",
     [
@@ -215,6 +229,25 @@ def test_a_function_as_view_is_given_again_to_load(linear, tmp_path):
     assert again.export_bytes("student.onnx") == result.export_bytes("student.onnx")
     with pytest.raises(SettingError, match="the function seen"):
         fdtasil.Distilled.load(folder).export_bytes("student.onnx")
+
+
+@pytest.mark.fault(323)
+def test_a_view_that_is_given_to_load_is_the_one_of_the_run(linear, tmp_path):
+    folder = fdtasil.distill(linear, TOY, 0, student_obs=seen, **QUICK).save(tmp_path / "seen")
+    with pytest.raises(SettingError, match="3 numbers"):
+        fdtasil.Distilled.load(folder, student_obs=lambda rows: rows[:, :3])
+    folder = fdtasil.distill(linear, TOY, 0, student_obs=[0, 1], **QUICK).save(tmp_path / "some")
+    assert fdtasil.Distilled.load(folder, student_obs=[0, 1]).view.columns == (0, 1)
+    with pytest.raises(SettingError, match="as the student was trained"):
+        fdtasil.Distilled.load(folder, student_obs=[2, 3])
+
+
+@pytest.mark.fault(330)
+def test_a_log_of_one_observation_is_warned_of():
+    actions = np.random.default_rng(0).uniform(-1, 1, (50, 1))
+    log = fdtasil.from_arrays(np.zeros((50, 3)), actions, episode_ends=[50], low=-1, high=1)
+    with pytest.warns(FdtasilWarning, match="all 50 observations are the same"):
+        fdtasil.distill(dataset=log, probes=0, fit=fdtasil.Fit(steps=40))
 
 
 def test_what_is_not_used_is_refused(run, quick):

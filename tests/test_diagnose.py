@@ -9,12 +9,13 @@ import onnx
 import pytest
 from conftest import GAIN, TOY, mlp_onnx
 from scipy.stats import spearmanr
+from toy_environments import Integrator
 from toy_forms import InForm, in_form
 
 import fdtasil
 from fdtasil.errors import ExpertError, SettingError
 from fdtasil.experts.load import load_expert
-from fdtasil.probes.scales import measure_scales
+from fdtasil.probes.scales import action_units, measure_scales
 from fdtasil.results.fidelity import fidelity_of
 from fdtasil.results.stability import Law, Stability, _interval, distances, stability_of
 from fdtasil.rollouts.behaviours import follow
@@ -244,6 +245,37 @@ def test_an_action_that_hardly_varies_is_measured_by_its_range():
     assert 0 < found.error < 0.01
     nothing = fidelity_of(linear(GAIN), linear(1e-8 * GAIN), states, UNITS, scales, random)
     assert np.isnan(nothing.errors).all()
+
+
+@pytest.mark.fault(318)
+@pytest.mark.parametrize(("size", "half"), [(1e-8, 1.0), (1.0, 1e6)])
+def test_fidelity_is_the_same_in_every_unit(size, half):
+    """Of actions without bounds the unit is what they vary by; bounds may be far beyond."""
+    states = np.random.default_rng(0).standard_normal((200, 5)).astype(np.float32)
+    low = np.full(2, -np.inf if half == 1 else -half)
+    units = action_units(low, -low, linear(size * GAIN)(states))
+    scales, random = measure_scales(states), np.random.default_rng(0)
+    pair = linear(0.9 * size * GAIN), linear(size * GAIN)
+    found = fidelity_of(*pair, states, units, scales, random)
+    assert found.errors == pytest.approx([0.1] * 4, abs=1e-3)
+
+
+class _Unbounded(Integrator):
+    def __init__(self):
+        super().__init__()
+        self.action_space = gymnasium.spaces.Box(-np.inf, np.inf, (2,), np.float32)
+
+    def step(self, action):
+        return super().step(np.clip(np.asarray(action) / 1e-6, -1, 1))
+
+
+@pytest.mark.fault(318)
+def test_disturbances_of_actions_without_bounds_are_in_their_own_unit():
+    expert = lambda rows: np.clip(linear(1e-6 * GAIN)(rows), -1e-6, 1e-6)  # noqa: E731
+    student = lambda rows: 0.9 * expert(rows)  # noqa: E731
+    found = fdtasil.diagnose(student, expert, _Unbounded, episodes=2, horizon=20)
+    assert found.fidelity.error == pytest.approx(0.1, abs=0.01)
+    assert 0.01 < found.largest_error < 1
 
 
 def test_coordinates_that_are_held_are_no_part_of_fidelity():
@@ -613,5 +645,6 @@ def test_gains_of_steps_are_said_to_be_none(tmp_path, capsys):
         y = Mul (steps, quarter)
     }"""
     onnx.save(onnx.parser.parse_model(text), tmp_path / "steps.onnx")
-    gains_command(str(tmp_path / "steps.onnx"), "InvertedPendulum-v5", states=3, horizon=20)
+    with pytest.warns(fdtasil.FdtasilWarning, match="does not change its actions"):
+        gains_command(str(tmp_path / "steps.onnx"), "InvertedPendulum-v5", states=3, horizon=20)
     assert "these are no derivatives" in capsys.readouterr().out

@@ -6,7 +6,7 @@ from dataclasses import replace
 import gymnasium
 import numpy as np
 import pytest
-from conftest import QUICK, TOY, mlp_onnx
+from conftest import GAIN, QUICK, TOY, mlp_onnx
 from toy_environments import Integrator
 
 import fdtasil
@@ -156,3 +156,12 @@ def test_another_expert_than_the_runs_is_told_of(tmp_path):
         judge(result, own, TOY, **look)
         with pytest.warns(FdtasilWarning, match="own.onnx .* judged by other.onnx .*: another"):
             judge(result, other, TOY, **look)
+
+
+@pytest.mark.fault(320)
+@pytest.mark.filterwarnings("ignore::fdtasil.errors.FdtasilWarning")
+def test_what_the_environment_clips_is_no_error():
+    beyond = lambda rows: 30 * np.asarray(rows, np.float32) @ GAIN.T  # noqa: E731
+    inside = lambda rows: np.clip(beyond(rows), -1, 1)  # noqa: E731
+    found = fdtasil.evaluate(inside, beyond, TOY, episodes=2, horizon=20, force=True)
+    assert found.action_error == 0

@@ -535,3 +535,14 @@ def test_answers_of_several_widths_are_told():
     expert = fdtasil.load_expert(lambda rows: np.ones((len(rows), 1 + len(rows))), batch=4)
     with pytest.raises(ExpertError, match="some batches with 3 actions, others with 5"):
         expert.ask(np.zeros((6, 3)), "check")
+
+
+@pytest.mark.fault(325)
+def test_masks_that_nobody_hands_over_are_warned_of():
+    class Masked:
+        def predict(self, observation, state=None, deterministic=False, action_masks=None):
+            return np.zeros((len(observation), 2)), None
+
+    with pytest.warns(fdtasil.FdtasilWarning, match="takes action_masks"):
+        expert = fdtasil.load_expert(Masked(), 5, 2)
+    assert not expert.ask(np.ones((2, 5)), "check").any()

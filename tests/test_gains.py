@@ -245,3 +245,26 @@ def test_a_coordinate_that_stands_still_does_not_hide_the_error_of_others():
 
     alone = gains(lambda seen: seen[:, :1] - 4, rows)  # of what stands still
     assert alone.relative_error < 0.05
+
+
+@pytest.mark.fault(327)
+@pytest.mark.parametrize("count", [1, 5, 8])
+def test_a_law_at_its_bounds_has_no_derivative_but_0(count):
+    law = lambda rows: np.clip(rows @ np.array([[3.0], [1.0]]), -1, 1)  # noqa: E731
+    states = np.random.default_rng(count).standard_normal((200, 2))
+    states = states[np.abs(states @ [3.0, 1.0]) > 1.5][:count]
+    with pytest.warns(fdtasil.FdtasilWarning, match="does not change its actions"):
+        found = gains(law, states)
+    wrong = np.abs(found.jacobian).max() > 0
+    assert found.unmoved[0] >= 0.01
+    assert found.relative_error == (1.0 if wrong else 0.0)
+    assert ("these are no derivatives" in str(found)) == wrong
+
+
+def test_one_law_at_its_bounds_takes_nothing_from_the_others():
+    law = lambda rows: np.stack([0.5 * rows[:, 0], np.clip(rows[:, 0] + 3, -1, 1)], 1)  # noqa: E731
+    states = np.random.default_rng(0).uniform(-1.5, 1.5, (20, 2))
+    with pytest.warns(fdtasil.FdtasilWarning, match=r"its actions \(1\)"):
+        found = gains(law, states)
+    assert found.jacobian[:, 0, 0] == pytest.approx(0.5, abs=1e-3)
+    assert found.error[0].max() < 1e-3

@@ -194,3 +194,18 @@ def test_an_expert_worse_than_chance_has_no_share():
     assert found.normalized_return is None
     assert found.ci95 is None
     assert "n/a" in str(found)
+
+
+@pytest.mark.fault(329)
+def test_a_counter_in_the_expert_is_not_taken_for_the_batch():
+    """It moves on by a call: rows that are asked alone differ, and do so once more."""
+    calls = iter(range(10**6))
+
+    def drifting(rows):
+        next(calls)
+        return rows @ GAIN.T * (1 + 3e-4 * (next(calls) > 8) * np.sin(next(calls)))
+
+    rows = np.random.default_rng(0).uniform(-0.5, 0.5, (16, 5)).astype(np.float32)
+    with pytest.raises(ExpertError, match="the same single observations twice") as caught:
+        admit_expert(load_expert(drifting), rows, BOXES)
+    assert "batch=1" not in caught.value.next_step

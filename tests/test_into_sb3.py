@@ -6,6 +6,7 @@ import pytest
 from conftest import GAIN, QUICK, TOY
 from sb3_agents import seeded
 from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormalize
+from toy_environments import Integrator
 from toy_forms import InForm, in_form
 
 import fdtasil
@@ -135,3 +136,28 @@ def test_a_student_of_all_columns_is_an_agent():
     rows = result.demonstrations.observations
     answers = result.to_sb3(InForm(), "SAC").predict(rows, deterministic=True)[0]
     assert answers == pytest.approx(result.student.predict(rows)[0], abs=1e-5)
+
+
+class _Beside(Integrator):
+    """The toy, whose last number is a large one that stands still."""
+
+    constant = 0.0
+
+    def _observe(self):
+        return np.concatenate([super()._observe()[:4], [self.constant]])
+
+
+@pytest.mark.fault(317)
+@pytest.mark.parametrize(("constant", "kept"), [(300.0, True), (1.7e9, False)])
+def test_a_constant_that_rounds_away_what_moves_is_refused(constant, kept, monkeypatch):
+    monkeypatch.setattr(_Beside, "constant", constant)
+    result = fdtasil.distill(law, _Beside, 0, **{**QUICK, "horizon": 10})
+    rows = result.demonstrations.observations
+    if kept:
+        agent = result.to_sb3(_Beside(), "SAC")
+        expected = result.student.predict(rows)[0]
+        assert agent.predict(rows, deterministic=True)[0] == pytest.approx(expected, abs=1e-3)
+    else:
+        with pytest.raises(ExportError, match=r"observation 4 is about 1\.7e") as caught:
+            result.to_sb3(_Beside(), "SAC")
+        assert "subtract" in caught.value.next_step

@@ -13,9 +13,10 @@ from toy_forms import InForm
 
 import fdtasil
 from fdtasil.errors import ExpertError, SettingError
-from fdtasil.experts.load import load_expert
+from fdtasil.experts.load import expert_in, load_expert
 from fdtasil.files.onnx.recurrent import find_memory
 from fdtasil.results.summary import call_of
+from fdtasil.rollouts.environments import EnvironmentPool
 from fdtasil.student.schedule import Schedule
 from fdtasil.testing import check_expert
 
@@ -403,15 +404,36 @@ def test_a_beginning_is_seen_in_any_unit_and_behind_one_buffer(unit, keeps):
         load_expert(FromOne(), N, 2)
 
 
-def test_a_memory_beside_parts_is_refused_with_what_to_do():
-    class OfParts:
-        def predict(self, observation, state=None, episode_start=None, deterministic=True):
-            count = len(observation["place"] if isinstance(observation, dict) else observation)
-            return np.zeros((count, 2)), np.zeros((count, 1))
+class OfParts:
+    """Pulls at the last place that it saw, which it is given by name."""
 
-    with pytest.raises(ExpertError, match="no rows of a known length") as caught:
-        fdtasil.distill(OfParts(), lambda: InForm("dictionary"), 0, progress=False, **QUICK)
-    assert "FlattenObservation" in caught.value.next_step
-    with pytest.raises(ExpertError, match="no rows of a known length") as caught:
-        load_expert(OfParts()).ask(np.zeros((2, N)), "check")
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        place = np.asarray(observation["place"], np.float32)
+        last = np.zeros_like(place) if state is None else state
+        return -0.5 * last[:, :2], place
+
+
+@pytest.mark.fault(322)
+def test_a_memory_beside_parts_is_carried_along():
+    made = lambda: InForm("dictionary")  # noqa: E731
+    with EnvironmentPool(made) as pool:
+        expert = expert_in(OfParts(), pool)
+        columns = list(pool.spaces.observations.columns("place"))
+    n = expert.observation_size - expert.memory.size
+    rows = np.random.default_rng(0).standard_normal((4, n)).astype(np.float32)
+    first, memory = expert.memory.step(rows, np.zeros((4, expert.memory.size), np.float32))
+    second, _ = expert.memory.step(rows, memory)
+    assert not first.any()
+    np.testing.assert_allclose(second, -0.5 * rows[:, columns][:, :2])
+    result = fdtasil.distill(OfParts(), made, 0, progress=False, **QUICK)
+    assert result.queries["remember"] > 0
+
+
+def test_a_memory_behind_observations_of_unknown_length_is_refused():
+    class OfAnyLength:
+        def predict(self, observation, state=None, episode_start=None, deterministic=True):
+            return np.zeros((len(observation), 2)), np.zeros((len(observation), 1))
+
+    with pytest.raises(ExpertError, match="nobody says how long") as caught:
+        load_expert(OfAnyLength()).ask(np.zeros((2, N)), "check")
     assert "observation_size=n" in caught.value.next_step

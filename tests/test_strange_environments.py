@@ -279,6 +279,29 @@ def test_where_two_long_observations_are_apart_is_told():
         assert len(other_environment(before | {"observation": junk}, now)) == 1
 
 
+@pytest.mark.fault(328)
+def test_another_expert_is_found_around_the_states_where_they_agree(linear, tmp_path):
+    """As two laws do that are at their bounds wherever the demonstrations went."""
+    visited = set()
+
+    class Noted(Integrator):
+        def _observe(self):
+            found = super()._observe()
+            visited.add(found.astype(np.float32).tobytes())
+            return found
+
+    def other(rows):
+        there = [row.tobytes() in visited for row in np.asarray(rows, np.float32)]
+        return np.where(np.array(there)[:, None], linear(rows), 0.5 * linear(rows))
+
+    with pytest.raises(Stop):
+        fdtasil.distill(linear, Noted, 2, out=tmp_path, callback=stop, **QUICK)
+    other.__name__ = linear.__name__
+    with pytest.raises(SettingError, match="moved by a probe"):
+        fdtasil.distill(other, Noted, 2, resume=tmp_path, **QUICK)
+    fdtasil.distill(linear, Noted, 2, resume=tmp_path, **QUICK)
+
+
 @pytest.mark.fault(180)
 @pytest.mark.parametrize("probes", [0, 2])
 def test_a_run_is_not_gone_on_with_by_another_expert(probes, linear, tmp_path):

@@ -419,3 +419,23 @@ def test_a_message_that_is_cut_short_is_an_end():
     for length in (0, 5, 8, 9, len(whole.getvalue()) - 1):
         with pytest.raises(EOFError):
             worker_process.receive(io.BytesIO(whole.getvalue()[:length]))
+
+
+@pytest.mark.fault(331)
+def test_ctrl_c_ends_idle_workers_too(rows, monkeypatch):
+    """A notebook keeps what was interrupted, and with it who was asked."""
+    expert = fdtasil.load_expert(lambda rows: rows[:, :2] + os.getpid() * 0.0, workers=2, batch=8)
+    before = expert.ask(rows, "check")
+    askers = expert.workers._askers
+    pids = [asker._process.pid for asker in askers if asker._process is not None]
+    assert pids
+
+    def interrupted(*arguments, **named):
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr("fdtasil.experts.workers.pool.wait", interrupted)
+        with pytest.raises(KeyboardInterrupt):
+            expert.ask(rows, "check")
+    assert gone(pids)
+    assert np.array_equal(expert.ask(rows, "check"), before)

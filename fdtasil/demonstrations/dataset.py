@@ -126,7 +126,7 @@ class Dataset:
     @reads(
         "demonstrations",
         "a demonstrations.npz written by fdtasil",
-        "check the path, or save again",
+        "check the path, or save again; of arrays: fdtasil.from_arrays(observations, actions)",
     )
     def from_bytes(data: bytes) -> "Dataset":
         """Read what `to_bytes` wrote; nothing is unpickled.

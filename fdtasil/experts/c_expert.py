@@ -9,6 +9,7 @@ import numpy as np
 
 from fdtasil.errors import ExpertError, ExportError
 from fdtasil.experts.expert import Expert, Hints, Origin
+from fdtasil.experts.onnx_expert import COLUMNS
 from fdtasil.files.compiled import shared_function
 from fdtasil.files.reading import read_limited
 from fdtasil.files.storage import sha256
@@ -16,6 +17,7 @@ from fdtasil.files.storage import sha256
 __all__ = ["open_c"]
 
 _LIMIT = 2**28  # bytes
+_COLUMNS = re.compile(rf"^ *{re.escape(COLUMNS)}: ([\d,]+)$", re.MULTILINE)
 _SIZES = re.compile(r"^#define STUDENT_(OBSERVATIONS|ACTIONS) (\d{1,9})$", re.MULTILINE)
 
 
@@ -46,8 +48,27 @@ def open_c(source: str | Path, hints: Hints) -> Expert:
         policy.compile()
     except ExportError as error:
         raise ExpertError(f"{source}: {error.found}", error.expected, error.next_step) from error
-    digest = sha256(text.encode())
-    return Expert(policy, Path(source).name, n, m, origin=Origin(str(source), digest))
+    origin = Origin(str(source), sha256(text.encode()), _columns(text, n, source))
+    return Expert(policy, Path(source).name, n, m, origin=origin)
+
+
+def _columns(text: str, n: int, source: str | Path) -> tuple[int, ...] | None:
+    """Return the columns of an observation that a file says it sees, or None.
+
+    Raises:
+        ExpertError: If it says so of others than it takes.
+    """
+    found = _COLUMNS.search(text)
+    if found is None:
+        return None
+    columns = tuple(int(column) for column in found[1].split(",") if column)
+    if len(columns) != n:
+        raise ExpertError(
+            f"{source} takes {n} numbers, and its comment names {len(columns)} columns",
+            "a column for each",
+            "export the student again: fdtasil export RUN student.c",
+        )
+    return columns
 
 
 class _Compiled:

@@ -342,11 +342,11 @@ def _is_the_policy(module: torch.nn.Module, observation_size: int | None) -> boo
 
 
 def _from_predictor(source: Predictor, hints: Hints) -> Expert:
-    # What remembers takes flat rows, with the memory behind them.
-    flat = hints.spaces is None or hints.spaces.observations.plain
+    layout = hints.spaces.observations if hints.spaces else None
+    parts = None if layout is None or layout.plain else layout
     chooses = hints.spaces is not None and bool(hints.spaces.actions.choices)
-    n = hints.observation_size if flat else None
-    found = open_predictor(source, n, chooses=chooses)
+    found = open_predictor(source, hints.observation_size, parts, chooses=chooses)
+    # What remembers takes flat rows, with the memory behind them, and makes parts of them itself.
     return dataclasses.replace(found, own_form=found.memory is None)
 
 

@@ -7,12 +7,13 @@ from typing import Any
 
 import numpy as np
 
-from fdtasil.errors import ExpertError
+from fdtasil.errors import ExpertError, warn
 from fdtasil.experts.expert import Expert
 from fdtasil.experts.own_jacobian import own_jacobian
 from fdtasil.experts.sb3.scores import scores_of
 from fdtasil.experts.sb3.wrapped import normaliser_of
 from fdtasil.experts.stateful import with_state
+from fdtasil.rollouts.spaces import Layout
 
 __all__ = ["open_predictor"]
 
@@ -20,7 +21,11 @@ _ITS_OWN = "stable_baselines3.common.base_class"
 
 
 def open_predictor(
-    source: Any, observation_size: int | None = None, *, chooses: bool = False
+    source: Any,
+    observation_size: int | None = None,
+    layout: Layout | None = None,
+    *,
+    chooses: bool = False,
 ) -> Expert:
     """Ask an object by its `predict`; one that returns a state has a memory.
 
@@ -29,7 +34,8 @@ def open_predictor(
 
     Args:
         source: The object.
-        observation_size: n, where observations are flat; else it is taken to have no memory.
+        observation_size: n, where it is known; else it is taken to have no memory.
+        layout: Of observations that it takes in parts; None where they are flat rows.
         chooses: Whether its actions are choices; an agent's scores are asked for in their place.
 
     Raises:
@@ -41,13 +47,20 @@ def open_predictor(
     parameters = _parameters_of(source.predict, name)
     options = {"deterministic": True} if "deterministic" in parameters else {}
     asked, statistics = _asked(source), normaliser_of(source)
+    if "action_masks" in parameters:
+        warn(
+            f"{name} takes action_masks, which nobody hands over here: where they forbid actions, "
+            "it is another policy without them. Pass a function that makes the masks of its "
+            "observations, and calls it with both"
+        )
     if "state" in parameters and observation_size is not None:
-        carried = with_state(asked, name, options, statistics, observation_size)
+        carried = with_state(asked, name, options, statistics, observation_size, layout)
         if carried is not None:
             return carried
     # DQN has a predict of its own, which is the policy's where nothing is random.
     scores = scores_of(getattr(source, "policy", source)) if chooses else None
-    answer = _Predicts(asked, name, options, statistics, scores, observation_size is not None)
+    known = observation_size is not None
+    answer = _Predicts(asked, name, options, statistics, scores, known)
     return Expert(answer, name, jacobian=own_jacobian(source))
 
 
@@ -76,7 +89,7 @@ class _Predicts:
         options: What `predict` is called with besides.
         statistics: The VecNormalize that it was trained in, or None.
         scores: What it chooses by, asked in its place; or None.
-        flat: Whether observations are flat rows of a known length, behind which a memory stands.
+        known: Whether the length of an observation is, behind which a memory stands.
     """
 
     source: Any
@@ -84,7 +97,7 @@ class _Predicts:
     options: Mapping[str, bool]
     statistics: Any
     scores: Callable[[Any], np.ndarray] | None = None
-    flat: bool = True
+    known: bool = True
 
     def __call__(self, observations: np.ndarray) -> np.ndarray:
         if self.statistics is not None:
@@ -95,12 +108,11 @@ class _Predicts:
         if not isinstance(result, tuple):
             return result
         actions, state = result
-        if state is not None and not self.flat:
+        if state is not None and not self.known:
             raise ExpertError(
-                f"{self.name} returns a state, and observations are no rows of a known length",
-                "flat rows (B, n), behind which a memory stands",
-                "wrap the environment in gymnasium.wrappers.FlattenObservation; without one, "
-                "write load_expert(..., observation_size=n)",
+                f"{self.name} returns a state, and nobody says how long an observation is",
+                "rows (B, n), behind which its memory stands",
+                "write load_expert(..., observation_size=n), or ask it in an environment",
             )
         if state is not None:
             raise ExpertError(

@@ -8,12 +8,18 @@ import numpy as np
 
 from fdtasil.experts.expert import Expert
 from fdtasil.experts.memory import Memory, begins_elsewhere, other_beginning, stateless
+from fdtasil.rollouts.spaces import Layout
 
 __all__ = ["with_state"]
 
 
 def with_state(
-    source: Any, name: str, options: Mapping[str, bool], statistics: Any, observation_size: int
+    source: Any,
+    name: str,
+    options: Mapping[str, bool],
+    statistics: Any,
+    observation_size: int,
+    layout: Layout | None = None,
 ) -> Expert | None:
     """Return an object with a memory as an expert, or None where it has none.
 
@@ -23,12 +29,15 @@ def with_state(
         options: What `predict` is called with besides.
         statistics: The VecNormalize that it was trained in, or None.
         observation_size: n.
+        layout: Of observations that it takes in parts; None where they are flat rows.
 
     Raises:
         ExpertError: If its memory does not begin with zeros.
     """
     try:
-        states = [_ask_first(source, rows, observation_size, options) for rows in (2, 3)]
+        nothing = [np.zeros((rows, observation_size), np.float32) for rows in (2, 3)]
+        asked = ((_in_parts(rows, layout), len(rows)) for rows in nothing)
+        states = [_ask_first(source, *rows, options) for rows in asked]
     except Exception:  # of the user's; the gate will show it
         return None
     if any(state is None for state in states) or len({len(_leaves(one)) for one in states}) > 1:
@@ -36,7 +45,8 @@ def with_state(
     axes = [_axis(*parts) for parts in zip(*map(_leaves, states), strict=True)]
     if None in axes:  # no memory of rows
         return None
-    step = _Carries(source, statistics, options, states[0], tuple(axis or 0 for axis in axes))
+    places = tuple(axis or 0 for axis in axes)
+    step = _Carries(source, statistics, options, layout, states[0], places)
     n, size = observation_size, _flat(_leaves(states[0]), step.axes).shape[1]
     memory = Memory(size, step, step.begin)
     some = np.random.default_rng(0).standard_normal((2, n)).astype(np.float32)
@@ -49,9 +59,12 @@ def with_state(
     return Expert(stateless(step, n), name, n + size, memory=memory)
 
 
-def _ask_first(source: Any, rows: int, n: int, options: Mapping[str, bool]) -> Any:
-    begun = np.ones(rows, bool)
-    answer = source.predict(np.zeros((rows, n), np.float32), episode_start=begun, **options)
+def _in_parts(rows: np.ndarray, layout: Layout | None) -> Any:
+    return rows if layout is None else layout.values(rows)
+
+
+def _ask_first(source: Any, observations: Any, rows: int, options: Mapping[str, bool]) -> Any:
+    answer = source.predict(observations, episode_start=np.ones(rows, bool), **options)
     return answer[1] if isinstance(answer, tuple) and len(answer) == 2 else None
 
 
@@ -91,6 +104,7 @@ class _Carries:
         source: Has `predict(observation, state, episode_start)`.
         statistics: The VecNormalize that it was trained in, or None.
         options: What `predict` is called with besides.
+        layout: Of observations that it takes in parts, or None.
         like: A state, for the kinds and shapes of its parts.
         axes: Of rows, in each part of a state.
     """
@@ -98,13 +112,13 @@ class _Carries:
     source: Any
     statistics: Any
     options: Mapping[str, bool]
+    layout: Layout | None
     like: Any
     axes: tuple[int, ...]
 
     def __call__(
         self, observations: np.ndarray, memories: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        observations = self._normalised(observations)
         rows, parts, start = len(observations), [], 0
         for part, axis in zip(_leaves(self.like), self.axes, strict=True):
             shape = np.moveaxis(part, axis, 0).shape[1:]
@@ -114,18 +128,17 @@ class _Carries:
             start = stop
         begun, state = np.zeros(rows, bool), _state_of(parts, self.like)
         actions, after = self.source.predict(
-            observations, state=state, episode_start=begun, **self.options
+            self._given(observations), state=state, episode_start=begun, **self.options
         )
         return actions, _flat(_leaves(after), self.axes)
 
     def begin(self, observations: np.ndarray) -> np.ndarray:
         """(B, n) -> (B, m), its first answers of episodes."""
         begun = np.ones(len(observations), bool)
-        return self.source.predict(
-            self._normalised(observations), episode_start=begun, **self.options
-        )[0]
+        return self.source.predict(self._given(observations), episode_start=begun, **self.options)[
+            0
+        ]
 
-    def _normalised(self, observations: np.ndarray) -> np.ndarray:
-        if self.statistics is None:
-            return observations
-        return self.statistics.normalize_obs(observations)
+    def _given(self, observations: np.ndarray) -> Any:
+        given = _in_parts(observations, self.layout)
+        return given if self.statistics is None else self.statistics.normalize_obs(given)

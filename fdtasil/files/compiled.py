@@ -40,7 +40,7 @@ def answers_of(source: str, main: str, rows: np.ndarray) -> np.ndarray:
         raise ExportError("no C compiler", "cc, gcc or clang", "install one, such as gcc")
     with tempfile.TemporaryDirectory() as folder:
         file, program = Path(folder) / "program.c", Path(folder) / "program"
-        file.write_text(source)
+        file.write_text(source, encoding="utf-8")
         command = [found, "-std=c99", "-O2", f"-D{main}", "-o", str(program), str(file), "-lm"]
         _run(command, "", f"{found} can't compile the C file")
         lines = "\n".join(" ".join(f"{number:.9g}" for number in row) for row in rows)
@@ -60,7 +60,7 @@ def shared_function(source: str, name: str) -> Callable[[int, int], None]:
     # What is loaded stays when the file goes; Windows keeps the file, too.
     with tempfile.TemporaryDirectory(ignore_cleanup_errors=True) as folder:
         file, library = Path(folder) / "policy.c", Path(folder) / "policy.so"
-        file.write_text(source)
+        file.write_text(source, encoding="utf-8")
         command = [found, "-std=c99", "-O2", "-shared", "-fPIC", "-o", str(library), str(file)]
         _run([*command, "-lm"], "", f"{found} can't compile the C file")
         # With the interpreter's lock held: the buffers of such a function are static.

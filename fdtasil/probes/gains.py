@@ -1,11 +1,11 @@
 """The Jacobian of any expert by central differences, with an estimate of its error."""
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from fdtasil.checks import check_count, spelt
-from fdtasil.errors import SettingError
+from fdtasil.errors import SettingError, warn
 from fdtasil.experts.expert import Expert
 from fdtasil.experts.load import ExpertLike, load_expert
 from fdtasil.probes.scales import least_steps, measure_scales
@@ -22,6 +22,7 @@ _BEYOND = (16 / 9 / 5) ** 0.5
 _ROUNDING = float(np.finfo(np.float32).eps)
 _RATIO = 4.0  # of a rung to the one below it
 _HEARD = 10.0  # times the noise of an action, that it changes by along coordinates that move
+_FAR = 0.01  # of the scale: who does not change at all within it has no derivative but 0
 _UNSURE = 0.3  # error, as a share of the Jacobian, above which nothing is left of it
 
 
@@ -38,6 +39,9 @@ class Gains:
         queries: Rows asked.
         still: Coordinates that stand still in the states, beside others: their scale of 1 is no
             measured one, and norms leave them out where the others count for more than noise.
+        unmoved: (m,) radius up to which an action does not change at all, at any of the states;
+            0 where it changes at the nearest. Such an action is at a bound, or switches: between
+            its derivatives, which are 0, and differences at `radius` lies the whole `error`.
     """
 
     jacobian: np.ndarray
@@ -47,6 +51,7 @@ class Gains:
     noise_floor: np.ndarray
     queries: int
     still: tuple[int, ...] = ()
+    unmoved: np.ndarray = field(default_factory=lambda: np.zeros(0))
 
     @property
     def relative_error(self) -> float:
@@ -70,8 +75,10 @@ class Gains:
             ("queries", f"{self.queries:,}"),
         ]
         if self.relative_error > _UNSURE:
-            told = "these are no derivatives: the expert answers in steps, or with noise"
-            rows.append(("note", told))
+            within, why = self.unmoved.max(initial=0), "the expert answers in steps, or with noise"
+            if within >= _FAR:
+                why = f"an action does not change within {within:.2g}, where they are 0"
+            rows.append(("note", f"these are no derivatives: {why}"))
         if self.still:
             listed = ", ".join(map(str, self.still[:6])) + ", ..." * (len(self.still) > 6)
             rows.append(("still", f"{listed}: moved by parts of 1; scale= says how far they go"))
@@ -129,21 +136,32 @@ def gains(
             "take those of a run: result.demonstrations.observations",
         )
     random = np.random.default_rng(check_count("seed", seed, 0))
-    noise, curvature, nearest = _law(asked, rows, units, random)
+    noise, curvature, nearest, unmoved = _law(asked, rows, units, random)
     radius = _best_radius(noise, curvature, nearest)
     jacobian, near = (_jacobian(asked, rows, units * reach) for reach in (radius, radius / 2))
     # On average over the states: what is left of single ones is more chance than error.
     spread = (noise / radius)[:, None] / units
     apart = np.nanmean((jacobian - near) ** 2, axis=0)
     beyond = np.maximum(apart - 5 * spread**2, 0) * _BEYOND
+    # One that never changes has the derivatives that were found.
+    at_a_bound = (unmoved >= _FAR) & (unmoved < _RUNGS[-1])
+    whole = np.sqrt(np.nanmean(jacobian**2, axis=0))
+    if at_a_bound.any():
+        listed = ", ".join(map(str, np.flatnonzero(at_a_bound)[:6]))
+        warn(
+            f"{asked.name} does not change its actions ({listed}) at all within "
+            f"{unmoved.max():.2g} of the scale of these states: it is at a bound there, where its "
+            "derivatives are 0, or it switches; differences farther away are none of them"
+        )
     return Gains(
         jacobian,
-        np.sqrt(beyond + spread**2),
+        np.where(at_a_bound[:, None], whole, np.sqrt(beyond + spread**2)),
         radius,
         units,
         noise * 2**0.5,
         asked.queries["probe"],
         () if scale is not None else _still(rows),
+        unmoved,
     )
 
 
@@ -193,11 +211,12 @@ def _units(rows: np.ndarray, scale: np.ndarray | None) -> np.ndarray:
 
 def _law(
     expert: Expert, rows: np.ndarray, units: np.ndarray, random: np.random.Generator
-) -> tuple[np.ndarray, np.ndarray, float]:
+) -> tuple[np.ndarray, np.ndarray, float, np.ndarray]:
     """Return (m,) a and b of the error of a derivative, a / radius and b * radius^2.
 
-    The third is the smallest radius that may be used: float32 rounds none of its halves away.
-    Derivatives at a radius and at a quarter of it differ by the errors of both.
+    The third is the smallest radius that may be used: float32 rounds none of its halves away. The
+    last are the (m,) radii up to which no action changes. Derivatives at a radius and at a quarter
+    of it differ by the errors of both.
     """
     from scipy.optimize import nnls  # loads for a moment, and few need it
 
@@ -226,7 +245,9 @@ def _law(
         lengths = np.linalg.norm(design, axis=0)  # the columns lie twenty powers of ten apart
         fitted, _ = nnls(design / lengths, np.ones(len(design)))
         noise[action], curvature[action] = np.sqrt(fitted / lengths)
-    return noise, curvature, 2 * float(rungs[0])
+    near = np.logical_and.accumulate((np.nan_to_num(slopes) == 0).all(axis=1), axis=0)
+    unmoved = (near * rungs[:, None]).max(axis=0)
+    return noise, curvature, 2 * float(rungs[0]), unmoved
 
 
 def _best_radius(noise: np.ndarray, curvature: np.ndarray, nearest: float) -> float:

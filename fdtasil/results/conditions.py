@@ -2,7 +2,8 @@
 
 Norms: a deviation is the root mean square over the coordinates that move, in the expert's standard
 deviations; an action is the Euclidean norm, in halves of the actions' ranges (where an action has
-no bounds, in its own unit). Delta is student - expert, as the environment takes their actions.
+no bounds, in the deviation of the expert's). Delta is student - expert, as the environment takes
+their actions.
 """
 
 import math

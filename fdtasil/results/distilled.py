@@ -4,7 +4,7 @@ import csv
 import io
 import json
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,7 @@ import numpy as np
 from fdtasil.checks import check_path
 from fdtasil.demonstrations.dataset import Dataset, check_shapes
 from fdtasil.demonstrations.states import Demonstrations
-from fdtasil.errors import ExportError, first_line, warn
+from fdtasil.errors import ExportError, SettingError, first_line, warn
 from fdtasil.experts.expert import rows_text
 from fdtasil.experts.onnx_expert import COLUMNS, FUNCTION, HISTORY
 from fdtasil.files.border import reads
@@ -49,7 +49,7 @@ from fdtasil.results.page import result_html
 from fdtasil.student.exports import SPACES, export, order_of
 from fdtasil.student.into_sb3 import agent_of
 from fdtasil.student.policy import Student
-from fdtasil.student.view import StudentObservation, Unseen, View
+from fdtasil.student.view import StudentObservation, Unseen, View, describe_view
 
 __all__ = ["Distilled", "write_run"]
 
@@ -179,14 +179,17 @@ class Distilled:
                 "one that sees the whole observation, as the agent will",
                 "go on with the student's own weights",
             )
-        return agent_of(self.student, env, algorithm, seed)
+        return agent_of(self.student, env, algorithm, seed, self._seen())
 
     def export_bytes(self, name: str | Path, inputs: str = "flat") -> bytes:
         """Return what `export` writes to a file of that name."""
+        return export(self.student, self._seen(), self._metadata(), name, inputs)
+
+    def _seen(self) -> np.ndarray:
+        """Return states of the training as the student sees them."""
         states = self.demonstrations.observations
         chosen = np.linspace(0, len(states) - 1, min(len(states), _PARITY_STATES)).astype(int)
-        seen = np.asarray(self.view.look(states[chosen]), np.float32)
-        return export(self.student, seen, self._metadata(), name, inputs)
+        return np.asarray(self.view.look(states[chosen]), np.float32)
 
     def save(self, folder: str | Path) -> Path:
         """Write the run folder.
@@ -225,16 +228,18 @@ class Distilled:
         Raises:
             StorageError: If a file is missing, changed since (but for the card), or not one of
                 ours.
+            SettingError: If the student sees something else.
         """
         read = reads(
             f"a run in {folder}",
             "a run folder written by this version of fdtasil",
             "check the path, or run distill again",
         )
-        return read(cls._read)(check_path("folder", folder), student_obs)
+        found = read(cls._read)(check_path("folder", folder))
+        return found if student_obs is None else replace(found, view=_given(student_obs, found))
 
     @classmethod
-    def _read(cls, folder: Path, student_obs: StudentObservation | None) -> "Distilled":
+    def _read(cls, folder: Path) -> "Distilled":
         check_finished(folder)
         files = verify(folder, edited=(CARD,))
         settings = unstamped(files[CONFIG], folder / CONFIG, older=True)
@@ -252,7 +257,7 @@ class Distilled:
             settings=settings,
             report=report,
             dataset=dataset,
-            view=_stored_view(settings["student_obs"], student_obs, dataset),
+            view=_stored(settings["student_obs"], dataset.demonstrations.observations[:256]),
         )
 
     def _metadata(self) -> Mapping[str, str]:
@@ -341,15 +346,33 @@ def _with_notes(report: Mapping[str, Any], notes: list[str]) -> bytes:
     return to_json({**report, "warnings": [*report["warnings"], *notes]})
 
 
-def _stored_view(
-    stored: list[int] | str | None, given: StudentObservation | None, dataset: Dataset
-) -> View:
-    states = dataset.demonstrations.observations[:256]
-    if not isinstance(stored, str):
-        return View.of(stored, states)
-    if given is not None:
-        return View.of(given, states)
-    return View(Unseen(stored), None, 0, np.ones(states.shape[1], bool))
+def _stored(seen: list[int] | str | None, states: np.ndarray) -> View:
+    """Return what a student sees, as a file says it: of a function its name alone."""
+    if isinstance(seen, str):
+        return View(Unseen(seen), None, 0, np.ones(states.shape[1], bool))
+    return View.of(seen, states)
+
+
+def _given(student_obs: StudentObservation, run: Distilled) -> View:
+    """Return what a caller says that the student of a run sees.
+
+    Raises:
+        SettingError: If the run says otherwise.
+    """
+    states, seen = run.demonstrations.observations[:256], run.settings["student_obs"]
+    view, expected = View.of(student_obs, states), run.student.observation_size
+    if isinstance(seen, str):
+        same = view.size == expected
+    else:
+        same = (view.columns, view.is_whole) == (run.view.columns, run.view.is_whole)
+    if not same:
+        raise SettingError(
+            f"student_obs is {describe_view(student_obs, states.shape[1])}: {view.size} numbers",
+            f"{'the whole observation' if seen is None else seen}: {expected} numbers, as the "
+            "student was trained",
+            "pass the function of then, or leave student_obs= out",
+        )
+    return view
 
 
 _COUNTS = {"observation_size", "past", "remembered"}

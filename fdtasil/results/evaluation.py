@@ -36,8 +36,8 @@ class Evaluation:
         survival: Share of the student's episodes that neither the environment ended, nor a policy
             that had no answer for too long.
         expert_survival: The same for the expert.
-        action_error: Mean Euclidean distance of the student's action to the expert's, on the
-            student's own states, in action units.
+        action_error: Mean Euclidean distance of the student's action to the expert's, as the
+            environment takes both, on the student's own states, in action units.
         imitation_gap: Largest distance between the two trajectories of a pair while both last,
             in the expert's standard deviations (root mean square over coordinates), averaged over
             pairs (TaSIL, section 2). Chaotic systems drift apart whatever the student does.
@@ -83,7 +83,7 @@ class Evaluation:
     expert_given_up: int = 0
 
     def to_json(self) -> dict[str, Any]:
-        """Return the evaluation as plain JSON values."""
+        """Return the evaluation as numbers, texts and lists; `action_error` may be NaN."""
         return to_plain(self)
 
     @classmethod

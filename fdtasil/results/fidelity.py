@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fdtasil.probes.scales import Scales
+from fdtasil.probes.scales import Scales, least_steps
 from fdtasil.rollouts.behaviours import Policy, has_none
 
 __all__ = ["GOOD", "USUAL", "Fidelity", "fidelity_of"]
@@ -19,7 +19,7 @@ GOOD = (
 )
 """What 80 % of the students of nine experts had (benchmarks/figures/fidelity.md)."""
 _DIRECTIONS = 8
-_STILL = 1e-6  # of half its range: an action that varies less does not
+_STILL = float(np.finfo(np.float32).eps)  # of half its range: what varies less is rounding
 _ROUNDING = 1e-5  # of how actions vary: an expert that changes less does not react
 
 
@@ -68,7 +68,7 @@ def fidelity_of(
         student: (B, n) -> (B, m) actions as the environment takes them.
         expert: The same; rows of NaN are no answer.
         states: (S, n) of the expert's own episodes; it has an answer at some.
-        units: (m,) of actions, half their range.
+        units: (m,) of the actions that stand still, half their range.
         scales: Of its states.
         random: Draws directions that nothing was trained on.
         held: Coordinates that nothing moves: choices, flags, whole numbers. Not all of them.
@@ -82,7 +82,8 @@ def fidelity_of(
     heard = ~has_none(answers)
     states, steps, theirs = states[heard], steps[heard], answers[heard].astype(np.float64)
     ours, varies = student(states).astype(np.float64), theirs.std(axis=0)
-    varies = np.where(varies > _STILL * units, varies, units)
+    still = np.maximum(_STILL * units, least_steps(theirs))
+    varies = np.where(varies > still, varies, units)
     pair = _Pair(student, expert, varies)
     noise = pair.noise(states, theirs, steps[:, 0])
     found = [pair.compared(states, theirs, ours, radius * steps) for radius in RADII]

@@ -115,15 +115,19 @@ def _nearness(
     """Ask the expert on the student's own states.
 
     Returns:
-        The mean distance of the actions, NaN where the expert has no answer anywhere; and, where
-        actions are choices, the share of the rows whose choices are all the same.
+        The mean distance of the actions as the environment takes them, NaN where the expert has no
+        answer anywhere; and, where actions are choices, the share of the rows whose choices are
+        all the same.
     """
-    acted = student.actions[student.valid]
+    layout = pool.spaces.actions
     said = expert.ask(student.observations[student.valid], "evaluate")
     heard = ~has_none(said)  # where the expert has an answer
-    acted, said, layout = acted[heard], said[heard], pool.spaces.actions
-    if not len(said):
+    if not heard.any():
         return float("nan"), None
+    acted, said = (
+        layout.centred(pool.bounds.put_inside(rows[heard])[0].copy())
+        for rows in (student.actions[student.valid], said)
+    )
     distance = float(np.linalg.norm(acted - said, axis=1).mean())
     if not layout.choices:
         return distance, None

@@ -11,6 +11,7 @@ from fdtasil.rollouts.episodes import Episodes
 __all__ = ["Smoothness", "smoothness_of"]
 
 _LEAST = 16  # steps of an episode whose spectrum is looked at
+_ROUNDING = 1e-20  # of the actions' squares: less about their mean is its rounding
 
 
 class Smoothness(NamedTuple):
@@ -58,7 +59,7 @@ def smoothness_of(episodes: Episodes, pool: EnvironmentPool, expert: Episodes) -
 
 
 def _high_frequency(actions: np.ndarray, lengths: np.ndarray) -> float | None:
-    fast = total = 0.0
+    fast = total = squares = 0.0
     for episode, length in zip(actions, lengths, strict=True):
         if length < _LEAST:
             continue
@@ -69,4 +70,5 @@ def _high_frequency(actions: np.ndarray, lengths: np.ndarray) -> float | None:
         power /= length  # its sum is that of the squares: every step counts the same
         fast += float(power[frequencies > 0.25].sum())
         total += float(power.sum())
-    return fast / total if total > 0 else None
+        squares += float(np.square(mine).sum())
+    return fast / total if total > _ROUNDING * squares else None

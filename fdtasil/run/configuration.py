@@ -248,6 +248,8 @@ class Configuration:
         if self.max_queries is None or total <= self.max_queries:
             return
         lower = "lower episodes, horizon or evaluation_episodes" if self.horizon else "probes=0"
+        if self._largest_batch(predicted):
+            lower = f"load_expert(..., batch=16), which is checked by fewer rows; {lower}"
         raise SettingError(
             f"this run may ask the expert {total:,} times ({rows_text(predicted)})",
             f"at most max_queries={self.max_queries:,}",

@@ -120,7 +120,8 @@ def diagnose(
         warn_of_another_expert(student, asked)
         scales = measure_scales(visited)
         scales = replace(scales, live=scales.live & np.isin(np.arange(visited.shape[1]), present))
-        pair = _Pair(pool, asked, act, scales, _units(pool), starts, seed, history > 1)
+        units = action_units(pool.boxes.low, pool.boxes.high, own.actions[own.valid])
+        pair = _Pair(pool, asked, act, scales, units, starts, seed, history > 1)
         pair.check_movable()
         return pair.diagnose(own, min(followed, length))
 
@@ -151,13 +152,6 @@ def _opened(
             "a policy with a memory", "two that depend on the observation", "see evaluate()"
         )
     return carry(asked, pool, history)[0], judged
-
-
-def _units(pool: EnvironmentPool) -> np.ndarray:
-    """Return half of each action's range, (m,); 1 where it has none."""
-    boxes = pool.boxes
-    with np.errstate(invalid="ignore"):  # of infinite bounds, which are not chosen
-        return np.where(boxes.bounded, (boxes.high - boxes.low) / 2, 1.0)
 
 
 @dataclass(frozen=True)
@@ -242,13 +236,12 @@ class _Pair:
 
     def _regime(self, own: Episodes) -> str | None:
         """Return how the expert answers; None where it does not, or always the same."""
-        visited, boxes = own.observations[own.valid], self.pool.boxes
+        visited = own.observations[own.valid]
         moved = self.scales.live & ~np.isin(np.arange(visited.shape[1]), list(self._held))
-        units = action_units(boxes.low, boxes.high, own.actions[own.valid])
         about = measure_scales(visited, moved), generator(self.seed, "calibration")
         with suppress(ExpertError):
             found = calibrate(
-                self.expert, visited, *about, PRESETS["standard"].radius, units=units
+                self.expert, visited, *about, PRESETS["standard"].radius, units=self.units
             )
             return found.regime if any(found.change) else None
         return None

@@ -19,6 +19,7 @@ __all__ = [
     "warn_of_falls",
     "warn_of_idle_weights",
     "warn_of_misfit",
+    "warn_of_one_state",
     "warn_of_rounded_movement",
     "warn_of_silence",
     "warn_of_small_units",
@@ -119,6 +120,15 @@ def warn_of_misfit(lesson: Lesson, student: Policy, steps: int, *, remembers: bo
             f"at the demonstrated states the student's actions are off by {error / deviation:.0%} "
             f"of what the expert's vary by: {cause}, or want more than {steps:,} steps "
             f"(fit=fdtasil.Fit(steps={2 * steps}))"
+        )
+
+
+def warn_of_one_state(states: Demonstrations) -> None:
+    """Warn of demonstrations that are one observation again and again, such as a dead sensor's."""
+    if len(states) > 1 and (states.observations == states.observations[0]).all():
+        warn(
+            f"all {len(states):,} observations are the same: a student can learn one answer from "
+            "them, and nothing of how it changes; look at where they come from"
         )
 
 

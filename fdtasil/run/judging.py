@@ -141,9 +141,19 @@ def acting(
         action_size: m.
         remembered: Of n, how many numbers are the memory of the expert beside it.
         purpose: That its rows are counted under.
+
+    Raises:
+        SettingError: If its file says that it sees something else.
     """
-    seen = judged.origin.columns if student_obs is None else student_obs
+    says = judged.origin.columns
+    seen = says if student_obs is None else student_obs
     view = View.of(visible(seen, states.shape[1], remembered), states[:256])
+    if says is not None and view.columns not in (None, says):
+        raise SettingError(
+            f"student_obs={list(view.columns or ())} of {judged.name}",
+            f"{list(says)}, as the file says itself",
+            "leave student_obs= out",
+        )
     return view.policy(sized(judged, view.size, action_size).policy(purpose))
 
 

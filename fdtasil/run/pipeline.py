@@ -83,9 +83,10 @@ def distill(
 ) -> Distilled:
     """Distil an expert that can only be asked into a small torch policy that reacts as it does.
 
-    The student matches the expert's actions at the states of the demonstrations, and the
-    expert's differences along probes around them (TaSIL, arXiv 2205.14812, appendix on finite
-    differences). The expert is never differentiated, unless `probes="jacobian"`.
+    The student matches the expert's actions at the states of the demonstrations, and its
+    differences along probes around them (TaSIL, arXiv 2205.14812, appendix on finite differences);
+    with "fresh", the default of cheap experts, its actions at the moved states. The expert is
+    never differentiated, unless `probes="jacobian"`.
 
     Args:
         expert: An ONNX path, the path of a stable-baselines3 zip, either of them on the Hugging
@@ -99,8 +100,8 @@ def distill(
             `fdtasil.Environment`, which says what it is made and reset with. None with `dataset`:
             then nothing is recorded or evaluated.
         probes: The derivative source. Left out, what `dataset` holds, or "fresh" for files,
-            modules and agents of few multiply-adds, 10 for others, and 0 where nothing that the
-            student sees can be moved a little. 0 (plain behaviour
+            torch modules and agents' zips of few multiply-adds, 10 for others, and 0 where nothing
+            that the student sees can be moved a little. 0 (plain behaviour
             cloning), "fresh" (asked anew at every visit, near and far; the answers are labels),
             N (N random directions at each state; half of them lead towards other visited states
             where few of all observations can occur), "sphere:N" (N isotropic directions at each
@@ -111,7 +112,8 @@ def distill(
             found by asking at a ladder of radii first.
         trainer: Who acts in which round: "bc" (the expert), "dagger" (a mixture of expert and
             student), "dart" (the expert with noise as large as the student's errors), "noise" (the
-            expert with noise in every second episode), or a trainer with settings of its own.
+            expert with noise in the first episode and every second one after it), or a trainer
+            with settings of its own.
         episodes: Number of demonstrations. Left out, 20, or those of `dataset`.
         horizon: Steps after which an episode is cut; default: the environment's time limit.
         seed: Equal seeds give equal bytes, on one machine with the same versions.

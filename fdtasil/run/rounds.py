@@ -25,6 +25,7 @@ from fdtasil.run.collecting import Collecting
 from fdtasil.run.configuration import Configuration
 from fdtasil.run.doubts import (
     warn_of_falls,
+    warn_of_one_state,
     warn_of_rounded_movement,
     warn_of_small_units,
     warn_of_still_coordinates,
@@ -87,6 +88,7 @@ class Rounds:
         """Warn of what the demonstrations lack, as soon as it is known."""
         last = round_ == len(self.run.rounds) - 1
         if last:
+            warn_of_one_state(lesson.dataset.demonstrations)
             warn_of_small_units(lesson.scales)
             warn_of_rounded_movement(lesson)
         if expert is not None and round_ == 0 and self.collecting is not None:

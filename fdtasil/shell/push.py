@@ -38,5 +38,9 @@ def command(
         print(f"  {len(data):12,} bytes  {name}")
     for name in left_over(there, files):
         print(f"  {'removed':>18}  {name}, of an earlier push; the history keeps it")
-    print("The card and the report name your expert as you did, with its path.", flush=True)
+    print(
+        "The card and the report name your expert as you did, with its path; the card also what "
+        "the environment was made with.",
+        flush=True,
+    )
     print(f"sent: {send(hub, repository, files, there, public=public)}")

@@ -3,6 +3,7 @@
 import hashlib
 from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
+from textwrap import wrap
 
 import numpy as np
 
@@ -20,6 +21,7 @@ _BEND = {
     "tanh": "tanhf(x)",
 }
 _A_LINE = 8  # numbers
+_WIDE = 92  # letters of a comment's line
 _TYPES = {np.dtype(np.float32): "float", np.dtype(np.int8): "signed char"}
 
 
@@ -69,11 +71,14 @@ def _answer(policy: PlainPolicy) -> str:
     """Return what the function answers, for a comment."""
     if not policy.choices:
         return "Raw observation -> action in the environment's units."
+    scores = {column for start, stop, _ in policy.choices for column in range(start, stop)}
+    numbers = [f"action[{column}]" for column in range(len(policy.half)) if column not in scores]
     told = (
         f"{first} + the place of the largest of action[{start}] to action[{stop - 1}]"
         for start, stop, first in policy.choices
     )
-    return "Raw observation -> scores, in place of actions. What is chosen:\n   " + (
+    mixed = f" {_plainly(', '.join(numbers))} in the environment's units, and" if numbers else ""
+    return f"Raw observation ->{mixed} scores, in place of actions. What is chosen:\n   " + (
         ";\n   ".join(told) + "."
     )
 
@@ -171,8 +176,9 @@ def _plain(array: np.ndarray) -> np.ndarray:
 
 
 def _plainly(text: str) -> str:
-    """Return a text that ends no comment."""
-    return "".join(c if c.isprintable() else "?" for c in text).replace("*", "?")[:200]
+    """Return a text that ends no comment, whole, in as many lines as it takes."""
+    plain = "".join(c if c.isprintable() else "?" for c in text).replace("*", "?")
+    return "\n     ".join(wrap(plain, _WIDE, break_long_words=False, break_on_hyphens=False))
 
 
 def _array(name: str, values: np.ndarray) -> str:

@@ -3,11 +3,12 @@
 import inspect
 from collections.abc import Callable, Mapping
 from pathlib import Path
+from textwrap import wrap
 
 import numpy as np
 
 from fdtasil.checks import check_choice
-from fdtasil.errors import ExportError, SettingError, in_one_line, shown
+from fdtasil.errors import ExportError, SettingError, printable, shown
 from fdtasil.experts.onnx_expert import COLUMNS, FUNCTION, HISTORY
 from fdtasil.files.onnx.export import check_finite, export_module
 from fdtasil.rollouts.history import present_size
@@ -22,6 +23,8 @@ from fdtasil.student.tflite import tflite_model
 
 __all__ = ["EXPORTS", "SPACES", "export", "order_of"]
 
+_INT8 = ".int8"
+_WIDE = 96  # letters of a line of a comment
 _LONG = 120  # letters of a list that a comment shows whole
 SPACES = "fdtasil.spaces"
 """What a file calls the spaces of its environment."""
@@ -126,8 +129,8 @@ def _h(student: Student, states: np.ndarray, metadata: Mapping[str, str]) -> byt
 def _py(student: Student, states: np.ndarray, metadata: Mapping[str, str]) -> bytes:
     _plain(student)  # who is no such network needs torch
     order = order_of(student, metadata)
-    first = f"# The observation: {in_one_line(order)}\n" if order else ""
-    return f"{first}{inspect.getsource(plain)}".encode()
+    lines = wrap(f"The observation: {printable(order)}", _WIDE) if order else []
+    return "".join([*(f"# {line}\n" for line in lines), inspect.getsource(plain)]).encode()
 
 
 EXPORTS: dict[str, Writer] = {
@@ -164,7 +167,8 @@ def export(
         ExportError: If the file's answers differ from the student's by more than 1e-5.
     """
     suffix = next((suffix for suffix in EXPORTS if str(name).endswith(suffix)), None)
-    if suffix is None:
+    eight_bits = suffix is not None and suffix.startswith(_INT8)
+    if suffix is None or (_INT8 in Path(name).suffixes and not eight_bits):
         raise SettingError(
             f"{str(name)!r} to export a student to",
             f"a name that ends with {' or '.join(EXPORTS)}",

@@ -5,6 +5,7 @@ import numpy as np
 from fdtasil.checks import check_count
 from fdtasil.errors import SettingError
 from fdtasil.rollouts.history import Window, present_size
+from fdtasil.student.asking import as_numbers, check_choosing
 from fdtasil.student.policy import Student
 
 __all__ = ["History"]
@@ -78,14 +79,8 @@ class History:
         if np.any(episode_start):
             self._window.clear()
         n = self.observation_size
-        try:
-            seen = np.asarray(observation, np.float32)
-        except (TypeError, ValueError) as error:
-            raise SettingError(
-                f"an observation that is a {type(observation).__name__}",
-                f"({n},), its flat form",
-                "pass result.dataset.spaces.observations.row(observation)",
-            ) from error
+        step = "pass result.dataset.spaces.observations.row(observation)"
+        seen = as_numbers(observation, f"({n},), its flat form", step)
         together = episodes == (1,) and seen.shape == (1, n)
         seen = seen[0] if together else seen
         if seen.shape != (n,):
@@ -100,6 +95,7 @@ class History:
         if spaces is None:
             self._window.push(seen, action)
             return action[None] if together else action, None
+        check_choosing(action[None], spaces.actions)
         self._window.push(seen, spaces.actions.done(action))
         actions = spaces.actions
         return actions.values(action[None]) if together else actions.value(action), None

@@ -40,7 +40,11 @@ ALGORITHMS: dict[str, tuple[Callable[[Any], Sequence[nn.Linear]], bool]] = {
 tanh and the bounds of a student are those of SAC and TD3, and PPO has none."""
 
 
-def agent_of(student: Student, env: Any, algorithm: str, seed: int) -> Any:
+_MOST = 1e-3
+"""How far answers of an agent and a student may be apart, in halves of an action's range."""
+
+
+def agent_of(student: Student, env: Any, algorithm: str, seed: int, states: np.ndarray) -> Any:
     """Return an agent whose actor is the student; its critics are fresh.
 
     The student's normaliser goes into the first layer, so the agent takes raw observations.
@@ -50,10 +54,11 @@ def agent_of(student: Student, env: Any, algorithm: str, seed: int) -> Any:
         env: A gymnasium id or environment, as stable-baselines3 takes it.
         algorithm: "SAC", "TD3", or "PPO".
         seed: Of the agent.
+        states: (B, n) of its training, on which both are compared.
 
     Raises:
         SettingError: If there is no such algorithm.
-        ExportError: If the student is no actor of it.
+        ExportError: If the student is no actor of it, or the agent answers otherwise.
     """
     layers_of, chooses = ALGORITHMS[check_choice("algorithm", algorithm, ALGORITHMS)]
     network, layers = student.architecture, _folded(student)
@@ -69,6 +74,7 @@ def agent_of(student: Student, env: Any, algorithm: str, seed: int) -> Any:
             "an Mlp on flat observations, with bounded numbers for SAC and TD3, choices for PPO",
             'take "PPO"' if choices else "go on with the student's own weights",
         )
+    _check_folded(student, network, layers, states)
     import stable_baselines3
 
     widths = list(network.hidden) if isinstance(network.hidden, tuple) else [network.hidden]
@@ -170,6 +176,31 @@ def _folded(student: Student) -> Layers | None:
         weight, bias = layers[-1]
         layers[-1] = weight * half[:, None], bias * half
     return layers
+
+
+def _check_folded(student: Student, network: Mlp, layers: Layers, states: np.ndarray) -> None:
+    """Refuse a first layer in which float32 rounds away what moves beside what does not.
+
+    Raises:
+        ExportError: If the answers differ.
+    """
+    rows, bend = torch.from_numpy(states), ACTIVATIONS[network.activation]()
+    (weight, bias), *rest = layers
+    with torch.no_grad():
+        values = rows @ weight.T + bias
+        for inner, offsets in rest:
+            values = bend(values) @ inner.T + offsets
+        if student.spaces is None or not student.spaces.actions.choices:
+            values = (student.low + student.high) / 2 + student.action_units * values.tanh()
+        apart = float(((values - student(rows)).abs() / student.action_units).max())
+    if not apart <= _MOST:
+        number = int((student.mean.abs() / student.scale).argmax())
+        raise ExportError(
+            f"an agent whose answers are {apart:.1g} of half the range away from the student's: "
+            f"observation {number} is about {float(student.mean[number]):.3g}, and moves little",
+            f"at most {_MOST:g}, and agents have no normaliser",
+            "subtract that number in the environment, and distil there",
+        )
 
 
 def _linear(network: Any) -> list[nn.Linear]:

@@ -117,8 +117,14 @@ class PlainPolicy:
         return cls(*plain, choices_of(parts), cut_of(low, high))
 
     def choose(self, observation: np.ndarray) -> np.ndarray:
-        """(n,) or (B, n) raw observations -> (c,) or (B, c), the best of each choice."""
+        """(n,) or (B, n) raw observations -> (c,) or (B, c), the best of each choice.
+
+        Raises:
+            ValueError: If an observation is NaN, of which nothing is the best.
+        """
         scores = self(observation)
+        if np.isnan(scores).any():
+            raise ValueError("scores that are NaN, where the best of them is asked for")
         best = [first + scores[..., a:b].argmax(axis=-1) for a, b, first in self.choices]
         return np.stack(best, axis=-1)
 

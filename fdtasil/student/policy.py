@@ -17,6 +17,7 @@ from fdtasil.files.tensors import tensors_from_bytes, tensors_to_bytes
 from fdtasil.probes.scales import Scales
 from fdtasil.rollouts.spaces import Mismatch, Spaces
 from fdtasil.student.architectures import Architecture, Mlp, architecture_of, describe
+from fdtasil.student.asking import as_numbers, check_choosing
 from fdtasil.student.plain import PlainPolicy, choices_of, cut_of, middle_of
 
 __all__ = ["Student"]
@@ -146,7 +147,7 @@ class Student(nn.Module):
             return None
         linear = [layer for layer in self.network if type(layer) is nn.Linear]
         weights = (one for layer in linear for one in (layer.weight, layer.bias))
-        key = [self.mean.data_ptr(), *(one.data_ptr() for one in weights)]
+        key = [one.data_ptr() for one in (*self.buffers(), *weights)]
         if self._plain is None or self._plain[0] != key:
             self._plain = key, self._in_numpy(self.architecture.activation, linear)
         return self._plain[1]
@@ -196,11 +197,7 @@ class Student(nn.Module):
         if self.spaces is not None:
             return self._in_spaces(observation, self.spaces), state
         n = self.observation_size
-        try:
-            rows = np.asarray(observation, np.float32)
-        except (TypeError, ValueError):
-            found = f"an observation that is a {type(observation).__name__}"
-            raise SettingError(found, f"({n},) or (B, {n}) numbers", "pass an array") from None
+        rows = as_numbers(observation, f"({n},) or (B, {n}) numbers", "pass an array")
         if rows.ndim not in (1, 2) or rows.shape[-1] != n:
             raise SettingError(
                 f"observation of shape {rows.shape}",
@@ -227,6 +224,7 @@ class Student(nn.Module):
                 _AS_SEEN,
             ) from None
         actions = self.answer(rows)
+        check_choosing(actions, spaces.actions)
         return spaces.actions.value(actions[0]) if one else spaces.actions.values(actions)
 
     def to_bytes(self, metadata: Mapping[str, str] | None = None) -> bytes:

@@ -12,6 +12,7 @@ from fdtasil.checks import spelt
 from fdtasil.demonstrations.states import Demonstrations
 from fdtasil.errors import SettingError, first_line
 from fdtasil.probes.answers import Answers
+from fdtasil.probes.scales import least_steps
 from fdtasil.rollouts.behaviours import Policy
 
 __all__ = ["StudentObservation", "Unseen", "View", "describe_view", "view_size"]
@@ -144,7 +145,9 @@ class View:
         # Exact derivatives have no offsets: a view that is linear keeps them too.
         sides = offsets or (1.0, -1.0)
         steps = [self._step(states, centres, offset * moved) / offset for offset in sides]
-        if not all(np.allclose(steps[0], step, rtol=0.01, atol=_SAME) for step in steps[1:]):
+        # Beside the largest of each coordinate, whatever its unit, and what float32 rounds away.
+        near = _SAME * np.abs(steps[0]).max(axis=(0, 1), initial=0.0) + least_steps(centres)
+        if not all(np.allclose(steps[0], step, rtol=0.01, atol=near) for step in steps[1:]):
             raise SettingError(
                 "student_obs is a curved function, and the derivatives are exact or central",
                 "a linear function, indices, or the forward stencil",

@@ -37,7 +37,7 @@ class WorkerGroup:
     """Asks batches side by side. Nothing runs before the first; copies of an expert share it."""
 
     def __init__(self, askers: Sequence[Asker]) -> None:
-        self._idle: SimpleQueue[Asker] = SimpleQueue()
+        self._askers, self._idle = tuple(askers), SimpleQueue[Asker]()
         for asker in askers:
             self._idle.put(asker)
         # One thread waits for each worker: at most as many as there are askers.
@@ -49,8 +49,8 @@ class WorkerGroup:
     ) -> list[np.ndarray]:
         """Return `ask(batch, answer)` of every batch, in their order.
 
-        The first failure stops the others: one worker may hang while another has raised. So does
-        Ctrl-C.
+        The first failure stops the others: one worker may hang while another has raised. Ctrl-C
+        stops all, the idle ones too.
         """
         call = _Call(ask)
         futures = [self._executor.submit(self._one, call, batch) for batch in batches]
@@ -60,6 +60,10 @@ class WorkerGroup:
                 if future in done:
                     future.result()  # raises what failed, before an unfinished one is waited for
             return [future.result() for future in futures]
+        except KeyboardInterrupt:
+            for asker in self._askers:  # of a notebook, which keeps what was interrupted
+                asker.stop()
+            raise
         finally:
             for future in futures:
                 future.cancel()
