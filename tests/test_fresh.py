@@ -605,6 +605,12 @@ def test_a_budget_says_how_many_probes_fit():
     fdtasil.distill(linear, TOY, source.format(7), max_queries=800, **QUICK)
     with pytest.raises(SettingError, match="7 probes fit"):
         fdtasil.distill(linear, TOY, source.format(8), max_queries=800, **QUICK)
+    with pytest.raises(SettingError, match="batch=16"):  # most of it is the gate's large batch
+        fdtasil.distill(linear, TOY, source.format(9), max_queries=200, **QUICK)
+    few = fdtasil.load_expert(linear, batch=16)
+    with pytest.raises(SettingError) as caught:
+        fdtasil.distill(few, TOY, source.format(9), max_queries=200, **QUICK)
+    assert "batch=16" not in caught.value.next_step
 
 
 @pytest.mark.fault(297)

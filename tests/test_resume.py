@@ -196,7 +196,9 @@ def test_stopped_while_the_probes_are_asked_nothing_is_lost(kept, tmp_path, monk
     assert resumed.queries == whole.queries
 
 
-@pytest.mark.filterwarnings("ignore:.*asked (twice|alone)", "ignore:.*has changed during the run")
+@pytest.mark.filterwarnings(
+    "ignore:.*(asked|observations) (twice|alone)", "ignore:.*has changed during the run"
+)
 def test_an_expert_that_does_not_repeat_itself_is_no_other_one(tmp_path):
     """The gate was told to let it through."""
     random, run = np.random.default_rng(0), {**QUICK, "probes": 0, "force": True}

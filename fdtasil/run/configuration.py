@@ -249,7 +249,7 @@ class Configuration:
             return
         lower = "lower episodes, horizon or evaluation_episodes" if self.horizon else "probes=0"
         if self._largest_batch(predicted):
-            lower = f"load_expert(..., batch=16), which is checked by fewer rows; {lower}"
+            lower = f"{lower}, write load_expert(..., batch=16), whose gate asks fewer rows"
         raise SettingError(
             f"this run may ask the expert {total:,} times ({rows_text(predicted)})",
             f"at most max_queries={self.max_queries:,}",
