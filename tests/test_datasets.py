@@ -156,6 +156,24 @@ def test_a_curved_function_needs_the_forward_stencil(linear):
 
 
 @pytest.mark.fault(319)
+@pytest.mark.parametrize(
+    ("offset", "deviation"), [(0.0, 1.0), (1.0, 3e-4), (256.0, 0.05), (2048.0, 0.5)]
+)
+def test_an_offset_that_a_function_takes_away_is_no_curve(offset, deviation):
+    for seed in range(5):
+        random = np.random.default_rng(seed)
+        states = (offset + deviation * random.standard_normal((300, 3))).astype(np.float32)
+        bank = 0.3 * deviation * random.standard_normal((10, 3)).astype(np.float32)
+        numbers = np.tile(np.arange(10, dtype=np.int32), (300, 1))
+        around = Answers(bank, numbers, np.zeros((300, 10, 2, 1)), np.ones(10))
+        view = View.of(lambda rows: rows[:, :2] - np.float32(offset), states)
+        view.answers(around, states, (1.0, -1.0))
+        curve = View.of(lambda rows: ((rows - np.float32(offset)) / deviation) ** 2, states)
+        with pytest.raises(SettingError, match="a curved function"):
+            curve.answers(around, states, (1.0, -1.0))
+
+
+@pytest.mark.fault(319)
 @pytest.mark.parametrize("unit", [1e-6, 1.0, 1e6])
 def test_a_function_is_curved_in_every_unit(unit):
     states = np.random.default_rng(0).uniform(0.1, 1, (50, 2)).astype(np.float32)

@@ -261,6 +261,23 @@ def test_a_law_at_its_bounds_has_no_derivative_but_0(count):
     assert ("these are no derivatives" in str(found)) == wrong
 
 
+@pytest.mark.parametrize("seed", range(3))
+def test_a_law_of_few_coordinates_is_not_taken_for_one_at_its_bounds(seed):
+    """Few rays meet the two coordinates that each action depends on, and most of those are cut."""
+    law = lambda rows: np.clip(-2 * rows[:, :17] - rows[:, 17:], -1, 1)  # noqa: E731
+    states = np.random.default_rng(seed).standard_normal((50, 34))
+    assert not gains(law, states, seed=seed).unmoved.any()
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_answers_in_steps_are_differenced_across_them(seed):
+    gain, step = np.array([[0.3], [0.1]]), 1 / 31
+    law = lambda rows: np.rint(rows @ gain / step) * step  # noqa: E731
+    found = gains(law, np.random.default_rng(seed).standard_normal((1, 2)))
+    assert not found.unmoved.any()
+    assert found.jacobian[0, 0] == pytest.approx(gain[:, 0], abs=0.1)
+
+
 def test_one_law_at_its_bounds_takes_nothing_from_the_others():
     law = lambda rows: np.stack([0.5 * rows[:, 0], np.clip(rows[:, 0] + 3, -1, 1)], 1)  # noqa: E731
     states = np.random.default_rng(0).uniform(-1.5, 1.5, (20, 2))

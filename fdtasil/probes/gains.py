@@ -39,9 +39,9 @@ class Gains:
         queries: Rows asked.
         still: Coordinates that stand still in the states, beside others: their scale of 1 is no
             measured one, and norms leave them out where the others count for more than noise.
-        unmoved: (m,) radius up to which an action does not change at all, at any of the states;
-            0 where it changes at the nearest. Such an action is at a bound, or switches: between
-            its derivatives, which are 0, and differences at `radius` lies the whole `error`.
+        unmoved: (m,) radius up to which an action does not change at all, where it is at an end
+            at every state, such as a bound, or switches; 0 for others. Between its derivatives,
+            which are 0, and differences at `radius` lies the whole `error`.
     """
 
     jacobian: np.ndarray
@@ -111,7 +111,8 @@ def gains(
         seed: Of the ladder's states and coordinates.
 
     Returns:
-        Jacobians and their errors, from 4 n rows for each state and about 1,300 for the ladder.
+        Jacobians and their errors, from 4 n rows for each state and about 1,300 for the ladder;
+        where an action seems to be at a bound, from 2 n + 1 more for each state.
 
     Raises:
         SettingError: If states or scale can't be used.
@@ -143,8 +144,8 @@ def gains(
     spread = (noise / radius)[:, None] / units
     apart = np.nanmean((jacobian - near) ** 2, axis=0)
     beyond = np.maximum(apart - 5 * spread**2, 0) * _BEYOND
-    # One that never changes has the derivatives that were found.
-    at_a_bound = (unmoved >= _FAR) & (unmoved < _RUNGS[-1])
+    at_a_bound = (unmoved >= _FAR) & _at_ends(asked, rows, units, unmoved >= _FAR)
+    unmoved = np.where(at_a_bound, unmoved, 0.0)
     whole = np.sqrt(np.nanmean(jacobian**2, axis=0))
     if at_a_bound.any():
         listed = ", ".join(map(str, np.flatnonzero(at_a_bound)[:6]))
@@ -248,6 +249,25 @@ def _law(
     near = np.logical_and.accumulate((np.nan_to_num(slopes) == 0).all(axis=1), axis=0)
     unmoved = (near * rungs[:, None]).max(axis=0)
     return noise, curvature, 2 * float(rungs[0]), unmoved
+
+
+def _at_ends(
+    expert: Expert, rows: np.ndarray, units: np.ndarray, suspected: np.ndarray
+) -> np.ndarray:
+    """Return which (m,) actions are at an end at every state, the largest around it or the least.
+
+    The ladder's rays are few, and may miss the coordinates that an action depends on; and answers
+    in steps change to both sides. One that never changes is at no end.
+    """
+    if not suspected.any():
+        return suspected
+    count, n = rows.shape
+    states, moved = np.repeat(rows, n, axis=0), np.tile(np.diag(units), (count, 1))
+    points = np.concatenate([rows, *_ends(states, moved)])
+    here, *there = np.split(expert.ask(points, "probe"), [count, count + count * n])
+    change = np.stack([one.reshape(count, n, -1) for one in there]) - here[None, :, None]
+    up, down = (change > 0).any(axis=(0, 2)), (change < 0).any(axis=(0, 2))
+    return np.asarray(~(up & down).any(axis=0) & (up | down).any(axis=0))
 
 
 def _best_radius(noise: np.ndarray, curvature: np.ndarray, nearest: float) -> float:

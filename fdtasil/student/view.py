@@ -12,7 +12,6 @@ from fdtasil.checks import spelt
 from fdtasil.demonstrations.states import Demonstrations
 from fdtasil.errors import SettingError, first_line
 from fdtasil.probes.answers import Answers
-from fdtasil.probes.scales import least_steps
 from fdtasil.rollouts.behaviours import Policy
 
 __all__ = ["StudentObservation", "Unseen", "View", "describe_view", "view_size"]
@@ -20,6 +19,7 @@ __all__ = ["StudentObservation", "Unseen", "View", "describe_view", "view_size"]
 StudentObservation = Sequence[int] | Sequence[str] | Callable[[np.ndarray], np.ndarray]
 """Indices of the coordinates that the student sees, names of parts, or (B, n) -> (B, k)."""
 
+_ROUNDINGS = 4  # of float32, in the difference of two steps
 _SAME = 1e-4  # relative; beyond the rounding of float32, below any nonlinearity worth the name
 
 
@@ -145,8 +145,7 @@ class View:
         # Exact derivatives have no offsets: a view that is linear keeps them too.
         sides = offsets or (1.0, -1.0)
         steps = [self._step(states, centres, offset * moved) / offset for offset in sides]
-        # Beside the largest of each coordinate, whatever its unit, and what float32 rounds away.
-        near = _SAME * np.abs(steps[0]).max(axis=(0, 1), initial=0.0) + least_steps(centres)
+        near = self._rounding(states, centres, moved, steps[0])
         if not all(np.allclose(steps[0], step, rtol=0.01, atol=near) for step in steps[1:]):
             raise SettingError(
                 "student_obs is a curved function, and the derivatives are exact or central",
@@ -157,6 +156,20 @@ class View:
         numbers = np.arange(len(bank), dtype=np.int32).reshape(whole.numbers.shape)
         gains = whole.gains[whole.numbers].reshape(-1)
         return Answers(bank, numbers, whole.values, gains)
+
+    def _rounding(
+        self, states: np.ndarray, centres: np.ndarray, moved: np.ndarray, step: np.ndarray
+    ) -> np.ndarray:
+        """Return how far (N, k, size) steps of a linear view may be apart, for each coordinate.
+
+        Beside the largest step, whatever its unit, it is what float32 rounds away of the moved
+        points, and of what the view makes of them.
+        """
+        largest, farthest = (np.abs(one).max(axis=(0, 1), initial=0.0) for one in (step, moved))
+        rounded = np.spacing(np.abs(states).max(axis=0, initial=0.0))
+        lost = np.divide(rounded, farthest, out=np.zeros(len(farthest)), where=farthest > 0)
+        own = np.spacing(np.abs(centres).max(axis=0, initial=0.0))
+        return (_SAME + _ROUNDINGS * lost.max(initial=0.0)) * largest + _ROUNDINGS * own
 
     def _step(self, states: np.ndarray, centres: np.ndarray, moved: np.ndarray) -> np.ndarray:
         points = states[:, None, :] + moved
