@@ -258,6 +258,10 @@ def test_a_view_that_is_given_to_load_is_the_one_of_the_run(linear, tmp_path):
     assert fdtasil.Distilled.load(folder, student_obs=[0, 1]).view.columns == (0, 1)
     with pytest.raises(SettingError, match="as the student was trained"):
         fdtasil.Distilled.load(folder, student_obs=[2, 3])
+    folder = fdtasil.distill(linear, TOY, 0, **QUICK).save(tmp_path / "whole")
+    fdtasil.Distilled.load(folder, student_obs=range(5))
+    with pytest.raises(SettingError, match="the whole observation"):
+        fdtasil.Distilled.load(folder, student_obs=range(4))
 
 
 @pytest.mark.fault(330)

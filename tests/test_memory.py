@@ -429,6 +429,14 @@ def test_a_memory_beside_parts_is_carried_along():
     assert result.queries["remember"] > 0
 
 
+def test_a_function_is_given_to_load_as_it_was_to_the_run(tmp_path):
+    """It sees the environment's observation, and the run's states have the memory behind them."""
+    part = lambda rows: rows[:, 1:]  # noqa: E731
+    result = fdtasil.distill(Remembers(), TOY, 0, student_obs=part, **QUICK)
+    again = fdtasil.Distilled.load(result.save(tmp_path / "run"), student_obs=part)
+    assert again.export_bytes("s.onnx") == result.export_bytes("s.onnx")
+
+
 def test_a_memory_behind_observations_of_unknown_length_is_refused():
     class OfAnyLength:
         def predict(self, observation, state=None, episode_start=None, deterministic=True):

@@ -250,7 +250,10 @@ class _Answers:
         )
         if found.problem is None:
             return found
-        again, _ = _one_by_one(self.expert, self.observations)
+        try:
+            again, _ = _one_by_one(self.expert, self.observations)
+        except ExpertError as error:
+            return Finding("answers", error.found, error)
         if not self._apart(again, other)[0]:
             return found
         text = f"{self.expert.name} asked the same single observations twice differs"

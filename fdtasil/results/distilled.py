@@ -49,7 +49,7 @@ from fdtasil.results.page import result_html
 from fdtasil.student.exports import SPACES, export, order_of
 from fdtasil.student.into_sb3 import agent_of
 from fdtasil.student.policy import Student
-from fdtasil.student.view import StudentObservation, Unseen, View, describe_view
+from fdtasil.student.view import StudentObservation, Unseen, View, describe_view, visible
 
 __all__ = ["Distilled", "write_run"]
 
@@ -360,14 +360,15 @@ def _given(student_obs: StudentObservation, run: Distilled) -> View:
         SettingError: If the run says otherwise.
     """
     states, seen = run.demonstrations.observations[:256], run.settings["student_obs"]
-    view, expected = View.of(student_obs, states), run.student.observation_size
+    n, expected = states.shape[1], run.student.observation_size
+    view = View.of(visible(student_obs, n, run.dataset.remembered), states)
     if isinstance(seen, str):
         same = view.size == expected
     else:
-        same = (view.columns, view.is_whole) == (run.view.columns, run.view.is_whole)
+        same = view.columns == ((*range(n),) if run.view.is_whole else run.view.columns)
     if not same:
         raise SettingError(
-            f"student_obs is {describe_view(student_obs, states.shape[1])}: {view.size} numbers",
+            f"student_obs is {describe_view(student_obs, n)}: {view.size} numbers",
             f"{'the whole observation' if seen is None else seen}: {expected} numbers, as the "
             "student was trained",
             "pass the function of then, or leave student_obs= out",

@@ -125,7 +125,7 @@ def _nearness(
     if not heard.any():
         return float("nan"), None
     acted, said = (
-        layout.centred(pool.bounds.put_inside(rows[heard])[0].copy())
+        layout.centred(pool.bounds.put_inside(rows[heard])[0].astype(np.float64))
         for rows in (student.actions[student.valid], said)
     )
     distance = float(np.linalg.norm(acted - said, axis=1).mean())

@@ -19,9 +19,8 @@ from fdtasil.rollouts.behaviours import Policy
 from fdtasil.rollouts.environments import EnvironmentPool
 from fdtasil.rollouts.spaces import Spaces, flat_layout
 from fdtasil.rollouts.trials import fingerprint, other_environment
-from fdtasil.run.subject import visible
 from fdtasil.student.policy import Student
-from fdtasil.student.view import StudentObservation, Unseen, View
+from fdtasil.student.view import StudentObservation, Unseen, View, visible
 
 __all__ = [
     "acting",

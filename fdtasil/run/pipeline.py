@@ -44,12 +44,12 @@ from fdtasil.run.judging import check_history
 from fdtasil.run.lesson import Lesson
 from fdtasil.run.report import config_of, no_answer, report_of
 from fdtasil.run.rounds import Rounds
-from fdtasil.run.subject import Subject, bounded, named, open_subject, visible
+from fdtasil.run.subject import Subject, bounded, named, open_subject
 from fdtasil.run.training import Training
 from fdtasil.seeding import episode_seeds
 from fdtasil.student.architectures import Architecture
 from fdtasil.student.fit import Fit
-from fdtasil.student.view import StudentObservation
+from fdtasil.student.view import StudentObservation, visible
 
 __all__ = ["distill"]
 

@@ -19,9 +19,9 @@ from fdtasil.rollouts.environments import EnvironmentLike, EnvironmentPool, boun
 from fdtasil.rollouts.history import past_size
 from fdtasil.rollouts.naming import columns_named
 from fdtasil.rollouts.spaces import Layout, Spaces, flat_layout
-from fdtasil.student.view import StudentObservation, describe_view
+from fdtasil.student.view import StudentObservation
 
-__all__ = ["Subject", "bounded", "named", "open_subject", "visible"]
+__all__ = ["Subject", "bounded", "named", "open_subject"]
 
 _ROUNDING = 1e-5  # of the largest score
 
@@ -200,23 +200,3 @@ def named(
     said, example = spelt("student_obs", student_obs), "write indices, such as 0 1 2"
     columns = (columns_named(str(name), observations, said, example) for name in names)
     return tuple(sorted({*chain.from_iterable(columns)}))
-
-
-def visible(
-    student_obs: StudentObservation | None, n: int, remembered: int
-) -> StudentObservation | None:
-    """Return what the student sees: never what the expert remembers.
-
-    Args:
-        student_obs: What the caller says, of the environment's own observations.
-        n: Length of an observation, with past and memory.
-        remembered: Length of the memory.
-    """
-    if not remembered:
-        return student_obs
-    own = n - remembered
-    if student_obs is None:
-        return tuple(range(own))
-    if callable(student_obs) and not isinstance(student_obs, type):
-        return lambda rows: student_obs(rows[:, :own])
-    return describe_view(student_obs, own)  # pyright: ignore[reportReturnType]

@@ -25,7 +25,7 @@ def as_numbers(observation: Any, expected: str, step: str) -> np.ndarray:
         if np.ma.is_masked(observation):
             raise ValueError
         return np.asarray(to_numpy(observation), np.float32)
-    except (TypeError, ValueError):
+    except (RuntimeError, TypeError, ValueError):  # torch's of a gradient, numpy's
         found = f"an observation that is a {type(observation).__name__}"
         raise SettingError(found, expected, step) from None
 

@@ -5,6 +5,7 @@ import pickle
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import wraps
 
 import numpy as np
 
@@ -14,7 +15,7 @@ from fdtasil.errors import SettingError, first_line
 from fdtasil.probes.answers import Answers
 from fdtasil.rollouts.behaviours import Policy
 
-__all__ = ["StudentObservation", "Unseen", "View", "describe_view", "view_size"]
+__all__ = ["StudentObservation", "Unseen", "View", "describe_view", "view_size", "visible"]
 
 StudentObservation = Sequence[int] | Sequence[str] | Callable[[np.ndarray], np.ndarray]
 """Indices of the coordinates that the student sees, names of parts, or (B, n) -> (B, k)."""
@@ -195,6 +196,26 @@ def describe_view(student_obs: object, n: int) -> tuple[int, ...] | str | None:
     if callable(student_obs) and not isinstance(student_obs, type):
         return _called(student_obs)
     return _indices(student_obs, n)
+
+
+def visible(
+    student_obs: StudentObservation | None, n: int, remembered: int
+) -> StudentObservation | None:
+    """Return what the student sees: never what the expert remembers.
+
+    Args:
+        student_obs: What the caller says, of the environment's own observations.
+        n: Length of an observation, with past and memory.
+        remembered: Length of the memory.
+    """
+    if not remembered:
+        return student_obs
+    own = n - remembered
+    if student_obs is None:
+        return tuple(range(own))
+    if callable(student_obs) and not isinstance(student_obs, type):
+        return wraps(student_obs)(lambda rows: student_obs(rows[:, :own]))
+    return describe_view(student_obs, own)  # pyright: ignore[reportReturnType]
 
 
 def _called(function: Callable[..., object]) -> str:
