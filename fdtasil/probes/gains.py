@@ -76,7 +76,7 @@ class Gains:
         ]
         if self.relative_error > _UNSURE:
             within, why = self.unmoved.max(initial=0), "the expert answers in steps, or with noise"
-            if within >= _FAR:
+            if within > 0:
                 why = f"an action does not change within {within:.2g}, where they are 0"
             rows.append(("note", f"these are no derivatives: {why}"))
         if self.still:
@@ -144,7 +144,9 @@ def gains(
     spread = (noise / radius)[:, None] / units
     apart = np.nanmean((jacobian - near) ** 2, axis=0)
     beyond = np.maximum(apart - 5 * spread**2, 0) * _BEYOND
-    at_a_bound = (unmoved >= _FAR) & _at_ends(asked, rows, units, unmoved >= _FAR)
+    at_a_bound = unmoved >= _FAR
+    if at_a_bound.any():
+        at_a_bound &= _one_sided(asked, rows, units)
     unmoved = np.where(at_a_bound, unmoved, 0.0)
     whole = np.sqrt(np.nanmean(jacobian**2, axis=0))
     if at_a_bound.any():
@@ -251,19 +253,14 @@ def _law(
     return noise, curvature, 2 * float(rungs[0]), unmoved
 
 
-def _at_ends(
-    expert: Expert, rows: np.ndarray, units: np.ndarray, suspected: np.ndarray
-) -> np.ndarray:
+def _one_sided(expert: Expert, rows: np.ndarray, units: np.ndarray) -> np.ndarray:
     """Return which (m,) actions are at an end at every state, the largest around it or the least.
 
     The ladder's rays are few, and may miss the coordinates that an action depends on; and answers
     in steps change to both sides. One that never changes is at no end.
     """
-    if not suspected.any():
-        return suspected
     count, n = rows.shape
-    states, moved = np.repeat(rows, n, axis=0), np.tile(np.diag(units), (count, 1))
-    points = np.concatenate([rows, *_ends(states, moved)])
+    points = np.concatenate([rows, *_ends(*_along_each(rows, units))])
     here, *there = np.split(expert.ask(points, "probe"), [count, count + count * n])
     change = np.stack([one.reshape(count, n, -1) for one in there]) - here[None, :, None]
     up, down = (change > 0).any(axis=(0, 2)), (change < 0).any(axis=(0, 2))
@@ -281,9 +278,14 @@ def _best_radius(noise: np.ndarray, curvature: np.ndarray, nearest: float) -> fl
 def _jacobian(expert: Expert, rows: np.ndarray, steps: np.ndarray) -> np.ndarray:
     """Return (N, m, n) central differences along each coordinate."""
     count, n = rows.shape
-    states, moved = np.repeat(rows, n, axis=0), np.tile(np.diag(steps), (count, 1))
-    slopes = _slope(expert, states, moved) / steps[np.tile(np.arange(n), count), None]
+    slopes = _slope(expert, *_along_each(rows, steps)) / steps[np.tile(np.arange(n), count), None]
     return slopes.reshape(count, n, -1).transpose(0, 2, 1)
+
+
+def _along_each(rows: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return (N n, n) states and displacements: each state once along each coordinate."""
+    count, n = rows.shape
+    return np.repeat(rows, n, axis=0), np.tile(np.diag(steps), (count, 1))
 
 
 def _ends(states: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

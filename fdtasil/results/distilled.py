@@ -361,14 +361,15 @@ def _given(student_obs: StudentObservation, run: Distilled) -> View:
     """
     states, seen = run.demonstrations.observations[:256], run.settings["student_obs"]
     n, expected = states.shape[1], run.student.observation_size
-    view = View.of(visible(student_obs, n, run.dataset.remembered), states)
+    looked = visible(student_obs, n, run.dataset.remembered)
+    view = View.of(looked, states)
     if isinstance(seen, str):
         same = view.size == expected
     else:
         same = view.columns == ((*range(n),) if run.view.is_whole else run.view.columns)
     if not same:
         raise SettingError(
-            f"student_obs is {describe_view(student_obs, n)}: {view.size} numbers",
+            f"student_obs is {describe_view(looked, n)}: {view.size} numbers",
             f"{'the whole observation' if seen is None else seen}: {expected} numbers, as the "
             "student was trained",
             "pass the function of then, or leave student_obs= out",

@@ -11,7 +11,7 @@ from fdtasil.files.compiled import answers_of, compiler
 from fdtasil.student.agreement import check_agreement
 from fdtasil.student.plain import PlainPolicy
 
-__all__ = ["FLOAT", "Layers", "c_header", "c_memory", "c_source", "check_parity"]
+__all__ = ["FLOAT", "Layers", "c_header", "c_memory", "c_source", "check_parity", "comment_lines"]
 
 _BEND = {
     "elu": "x > 0.0f ? x : expm1f(x)",
@@ -178,7 +178,12 @@ def _plain(array: np.ndarray) -> np.ndarray:
 def _plainly(text: str) -> str:
     """Return a text that ends no comment, whole, in as many lines as it takes."""
     plain = "".join(c if c.isprintable() else "?" for c in text).replace("*", "?")
-    return "\n     ".join(wrap(plain, _WIDE, break_long_words=False, break_on_hyphens=False))
+    return "\n     ".join(comment_lines(plain))
+
+
+def comment_lines(text: str) -> list[str]:
+    """Return a text as lines of a comment; no name of it is broken, however long it is."""
+    return wrap(text, _WIDE, break_long_words=False, break_on_hyphens=False)
 
 
 def _array(name: str, values: np.ndarray) -> str:

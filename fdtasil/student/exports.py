@@ -3,7 +3,6 @@
 import inspect
 from collections.abc import Callable, Mapping
 from pathlib import Path
-from textwrap import wrap
 
 import numpy as np
 
@@ -14,7 +13,7 @@ from fdtasil.files.onnx.export import check_finite, export_module
 from fdtasil.rollouts.history import present_size
 from fdtasil.student import plain
 from fdtasil.student.c_int8 import INT8, rounded
-from fdtasil.student.c_source import c_header, c_source, check_parity
+from fdtasil.student.c_source import c_header, c_source, check_parity, comment_lines
 from fdtasil.student.int8 import as_int8, check_change
 from fdtasil.student.own_form import check_own_form, own_form
 from fdtasil.student.plain import PlainPolicy
@@ -24,7 +23,6 @@ from fdtasil.student.tflite import tflite_model
 __all__ = ["EXPORTS", "SPACES", "export", "order_of"]
 
 _INT8 = ".int8"
-_WIDE = 96  # letters of a line of a comment
 _LONG = 120  # letters of a list that a comment shows whole
 SPACES = "fdtasil.spaces"
 """What a file calls the spaces of its environment."""
@@ -129,7 +127,7 @@ def _h(student: Student, states: np.ndarray, metadata: Mapping[str, str]) -> byt
 def _py(student: Student, states: np.ndarray, metadata: Mapping[str, str]) -> bytes:
     _plain(student)  # who is no such network needs torch
     order = order_of(student, metadata)
-    lines = wrap(f"The observation: {printable(order)}", _WIDE) if order else []
+    lines = comment_lines(f"The observation: {printable(order)}") if order else []
     return "".join([*(f"# {line}\n" for line in lines), inspect.getsource(plain)]).encode()
 
 

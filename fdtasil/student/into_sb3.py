@@ -1,6 +1,7 @@
 """A student inside an agent of stable-baselines3, to go on by reinforcement learning."""
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -74,7 +75,7 @@ def agent_of(student: Student, env: Any, algorithm: str, seed: int, states: np.n
             "an Mlp on flat observations, with bounded numbers for SAC and TD3, choices for PPO",
             'take "PPO"' if choices else "go on with the student's own weights",
         )
-    _check_folded(student, network, layers, states)
+    _check_folded(student, layers, states, choices=choices)
     import stable_baselines3
 
     widths = list(network.hidden) if isinstance(network.hidden, tuple) else [network.hidden]
@@ -178,21 +179,26 @@ def _folded(student: Student) -> Layers | None:
     return layers
 
 
-def _check_folded(student: Student, network: Mlp, layers: Layers, states: np.ndarray) -> None:
+def _check_folded(student: Student, layers: Layers, states: np.ndarray, *, choices: bool) -> None:
     """Refuse a first layer in which float32 rounds away what moves beside what does not.
 
     Raises:
         ExportError: If the answers differ.
     """
-    rows, bend = torch.from_numpy(states), ACTIVATIONS[network.activation]()
-    (weight, bias), *rest = layers
-    with torch.no_grad():
-        values = rows @ weight.T + bias
-        for inner, offsets in rest:
-            values = bend(values) @ inner.T + offsets
-        if student.spaces is None or not student.spaces.actions.choices:
-            values = (student.low + student.high) / 2 + student.action_units * values.tanh()
-        apart = float(((values - student(rows)).abs() / student.action_units).max())
+    policy = student.plain
+    assert policy is not None, "an Mlp on the CPU"
+    half, centre = policy.half, policy.centre
+    if choices:  # an agent's logits are the scores of the layers alone
+        half, centre = np.ones_like(half), np.zeros_like(centre)
+    folded = replace(
+        policy,
+        mean=np.zeros_like(policy.mean),
+        scale=np.ones_like(policy.scale),
+        layers=[(weight.numpy(), bias.numpy()) for weight, bias in layers],
+        half=half,
+        centre=centre,
+    )
+    apart = float((np.abs(folded(states) - policy(states)) / policy.half).max())
     if not apart <= _MOST:
         number = int((student.mean.abs() / student.scale).argmax())
         raise ExportError(

@@ -147,7 +147,8 @@ class Student(nn.Module):
             return None
         linear = [layer for layer in self.network if type(layer) is nn.Linear]
         weights = (one for layer in linear for one in (layer.weight, layer.bias))
-        key = [one.data_ptr() for one in (*self.buffers(), *weights)]
+        # Walking the modules for `buffers()` takes a quarter of the time of an answer.
+        key = [one.data_ptr() for one in (*self._buffers.values(), *weights) if one is not None]
         if self._plain is None or self._plain[0] != key:
             self._plain = key, self._in_numpy(self.architecture.activation, linear)
         return self._plain[1]

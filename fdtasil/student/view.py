@@ -146,7 +146,7 @@ class View:
         # Exact derivatives have no offsets: a view that is linear keeps them too.
         sides = offsets or (1.0, -1.0)
         steps = [self._step(states, centres, offset * moved) / offset for offset in sides]
-        near = self._rounding(states, centres, moved, steps[0])
+        near = _rounding(states, centres, moved, steps[0]) if len(steps) > 1 else 0.0
         if not all(np.allclose(steps[0], step, rtol=0.01, atol=near) for step in steps[1:]):
             raise SettingError(
                 "student_obs is a curved function, and the derivatives are exact or central",
@@ -158,24 +158,25 @@ class View:
         gains = whole.gains[whole.numbers].reshape(-1)
         return Answers(bank, numbers, whole.values, gains)
 
-    def _rounding(
-        self, states: np.ndarray, centres: np.ndarray, moved: np.ndarray, step: np.ndarray
-    ) -> np.ndarray:
-        """Return how far (N, k, size) steps of a linear view may be apart, for each coordinate.
-
-        Beside the largest step, whatever its unit, it is what float32 rounds away of the moved
-        points, and of what the view makes of them.
-        """
-        largest, farthest = (np.abs(one).max(axis=(0, 1), initial=0.0) for one in (step, moved))
-        rounded = np.spacing(np.abs(states).max(axis=0, initial=0.0))
-        lost = np.divide(rounded, farthest, out=np.zeros(len(farthest)), where=farthest > 0)
-        own = np.spacing(np.abs(centres).max(axis=0, initial=0.0))
-        return (_SAME + _ROUNDINGS * lost.max(initial=0.0)) * largest + _ROUNDINGS * own
-
     def _step(self, states: np.ndarray, centres: np.ndarray, moved: np.ndarray) -> np.ndarray:
         points = states[:, None, :] + moved
         seen = self.look(points.reshape(-1, points.shape[-1]))
         return seen.reshape(*points.shape[:2], -1) - centres[:, None, :]
+
+
+def _rounding(
+    states: np.ndarray, centres: np.ndarray, moved: np.ndarray, step: np.ndarray
+) -> np.ndarray:
+    """Return how far (N, k, size) steps of a linear view may be apart, for each coordinate.
+
+    Beside the largest step, whatever its unit, it is what float32 rounds away of the moved
+    points, and of what the view makes of them.
+    """
+    largest, farthest = (np.abs(one).max(axis=(0, 1), initial=0.0) for one in (step, moved))
+    rounded = np.spacing(np.abs(states).max(axis=0, initial=0.0))
+    lost = np.divide(rounded, farthest, out=np.zeros(len(farthest)), where=farthest > 0)
+    own = np.spacing(np.abs(centres).max(axis=0, initial=0.0))
+    return (_SAME + _ROUNDINGS * lost.max(initial=0.0)) * largest + _ROUNDINGS * own
 
 
 def view_size(student_obs: StudentObservation | None, n: int) -> int | None:

@@ -42,7 +42,7 @@ class WorkerGroup:
             self._idle.put(asker)
         # One thread waits for each worker: at most as many as there are askers.
         self._executor = ThreadPoolExecutor(len(askers), thread_name_prefix="fdtasil-worker")
-        weakref.finalize(self, _close, os.getpid(), self._executor, tuple(askers))
+        weakref.finalize(self, _close, os.getpid(), self._executor, self._askers)
 
     def each(
         self, ask: Callable[[np.ndarray, Policy], np.ndarray], batches: Sequence[np.ndarray]
