@@ -350,6 +350,9 @@ FAULTS = {
         329: "an expert's noise, taken for a dependence on the batch",
         330: "a log in which nothing moves",
         331: "workers that outlive Ctrl-C in a notebook",
+        332: "a result that is judged through another view than its own",
+        333: "a function that sees as a run's indices do, given to load",
+        334: "a predict with a state that answers one choice a row",
     },
 }
 

@@ -421,9 +421,11 @@ def test_letters_beyond_ascii_are_written_in_every_locale(tmp_path):
 
 
 @pytest.mark.fault(321)
-@pytest.mark.parametrize("name", ["s.int8.py", "s.int8.h", "s.int8.safetensors", "s.int8.tflite"])
+@pytest.mark.parametrize(
+    "name", ["s.int8.py", "s.int8.h", "s.int8.tflite", "s.int8.v2.onnx", "s.INT8.onnx", "s.INT8.c"]
+)
 def test_eight_bits_are_refused_where_there_are_none(name, quick):
-    with pytest.raises(SettingError, match="a name that ends with"):
+    with pytest.raises(SettingError, match=r"\.int8\.onnx or \.int8\.c at the end"):
         quick.export_bytes(name)
 
 

@@ -264,6 +264,36 @@ def test_a_view_that_is_given_to_load_is_the_one_of_the_run(linear, tmp_path):
         fdtasil.Distilled.load(folder, student_obs=range(4))
 
 
+@pytest.mark.fault(332)
+def test_a_result_is_judged_through_what_it_sees_alone(linear, tmp_path):
+    about = {"episodes": 2, "horizon": 20}
+    result = fdtasil.distill(linear, TOY, 0, student_obs=[0, 1], **QUICK)
+    for same in ([0, 1], lambda rows: rows[:, :2]):
+        assert fdtasil.evaluate(result, linear, TOY, student_obs=same, **about) == (
+            fdtasil.evaluate(result, linear, TOY, **about)
+        )
+    folder, file = result.save(tmp_path / "run"), result.export(tmp_path / "s.onnx")
+    for policy in (result, folder, file):
+        for other in ([2, 3], [1, 0], lambda rows: rows[:, 2:4]):
+            with pytest.raises(SettingError, match=r"as the (student was trained|file says)"):
+                fdtasil.evaluate(policy, linear, TOY, student_obs=other, **about)
+    whole = fdtasil.distill(linear, TOY, 0, **QUICK)
+    with pytest.raises(SettingError, match="the whole observation: 5 numbers"):
+        fdtasil.evaluate(whole, linear, TOY, student_obs=backwards, **about)
+
+
+@pytest.mark.fault(333)
+def test_a_function_that_sees_as_a_run_does_is_taken_by_load(linear, tmp_path):
+    folder = fdtasil.distill(linear, TOY, 0, student_obs=[0, 1], **QUICK).save(tmp_path / "some")
+    again = fdtasil.Distilled.load(folder, student_obs=lambda rows: rows[:, :2])
+    assert again.view.columns == (0, 1)
+    with pytest.raises(SettingError) as refused:
+        fdtasil.Distilled.load(folder, student_obs=lambda rows: rows[:, 1::-1])
+    assert "the function of then" not in str(refused.value)
+    folder = fdtasil.distill(linear, TOY, 0, **QUICK).save(tmp_path / "whole")
+    assert fdtasil.Distilled.load(folder, student_obs=lambda rows: rows * 1.0).view.is_whole
+
+
 @pytest.mark.fault(330)
 def test_a_log_of_one_observation_is_warned_of():
     actions = np.random.default_rng(0).uniform(-1, 1, (50, 1))

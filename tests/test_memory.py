@@ -429,6 +429,31 @@ def test_a_memory_beside_parts_is_carried_along():
     assert result.queries["remember"] > 0
 
 
+class Chooses:
+    """One choice a row, (B,) integers, of the last and of the present observation."""
+
+    def __init__(self, first=0):
+        self.first = first
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        last = np.zeros((len(observation), 1), np.float32) if state is None else state
+        lean = observation[:, 2] + 0.5 * observation[:, 3] + 0.1 * last[:, 0]
+        choice = (lean > 0).astype(int)
+        return choice if state is not None else choice ^ self.first, observation[:, 2:3]
+
+
+@pytest.mark.fault(334)
+def test_a_memory_of_one_choice_a_row_is_carried_along():
+    assert distil_cart_pole(Chooses()).queries["remember"] > 0
+    with pytest.raises(ExpertError, match="another memory than zeros"):
+        distil_cart_pole(Chooses(first=1))
+
+
+def distil_cart_pole(expert):
+    about = QUICK | {"horizon": 20}
+    return fdtasil.distill(expert, "CartPole-v1", 0, progress=False, **about)
+
+
 def test_a_function_is_given_to_load_as_it_was_to_the_run(tmp_path):
     """It sees the environment's observation, and the run's states have the memory behind them."""
     part = lambda rows: rows[:, 1:]  # noqa: E731

@@ -54,10 +54,15 @@ def begins_elsewhere(memory: Memory, observations: np.ndarray) -> bool:
         return False
     nothing = np.zeros((len(observations), memory.size), np.float32)
     # A copy: who answers may write its next answer into the array of the last.
-    zeros = np.array(memory.step(observations.copy(), nothing)[0])
-    begun = memory.begin(observations.copy())
+    zeros = _rows(np.array(memory.step(observations.copy(), nothing)[0]))
+    begun = _rows(memory.begin(observations.copy()))
     least = 1e-4 * largest_action(np.concatenate([zeros, begun]))
     return not np.allclose(begun, zeros, rtol=1e-3, atol=least, equal_nan=True)
+
+
+def _rows(answers: np.ndarray) -> np.ndarray:
+    """Return (B, m) answers; one choice a row may come as (B,)."""
+    return np.reshape(answers, (len(answers), -1))
 
 
 def beginning_problem(memory: Memory, observations: np.ndarray, name: str) -> ExpertError | None:

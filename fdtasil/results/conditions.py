@@ -129,7 +129,7 @@ def errors_of(
         student: (B, n) -> (B, m) actions as the environment takes them.
         expert: The same.
         states: (S, n).
-        units: (m,) of actions, half their range.
+        units: (m,) of actions, from `action_units`.
         scales: Of the expert's states.
         random: Draws directions that nothing was trained on.
         held: Coordinates that nothing moves.

@@ -28,7 +28,7 @@ class Diagnosis:
         fidelity: Errors of the student's differences, by radius, beside the expert's roughness.
         stability: What the expert's closed loop makes of small disturbances of its actions.
         largest_error: Largest error of the student on its own paths, in units of half an action's
-            range, where the expert has an answer.
+            range (the expert's deviation where it has none), where the expert has an answer.
         disturbed: How far disturbances of the expert led that were as large, in deviations; None
             where none were, or the student makes no error.
         by_law: gamma(largest_error): how far that leads by the measured law; None where no law was

@@ -49,9 +49,16 @@ from fdtasil.results.page import result_html
 from fdtasil.student.exports import SPACES, export, order_of
 from fdtasil.student.into_sb3 import agent_of
 from fdtasil.student.policy import Student
-from fdtasil.student.view import StudentObservation, Unseen, View, describe_view, visible
+from fdtasil.student.view import (
+    StudentObservation,
+    Unseen,
+    View,
+    describe_view,
+    sees_as,
+    visible,
+)
 
-__all__ = ["Distilled", "write_run"]
+__all__ = ["Distilled", "given_view", "write_run"]
 
 _PARITY_STATES = 1000
 _PATIENCE = 60.0  # seconds that save() waits for another process that saves into the folder
@@ -236,7 +243,9 @@ class Distilled:
             "check the path, or run distill again",
         )
         found = read(cls._read)(check_path("folder", folder))
-        return found if student_obs is None else replace(found, view=_given(student_obs, found))
+        if student_obs is None:
+            return found
+        return replace(found, view=given_view(student_obs, found))
 
     @classmethod
     def _read(cls, folder: Path) -> "Distilled":
@@ -353,8 +362,12 @@ def _stored(seen: list[int] | str | None, states: np.ndarray) -> View:
     return View.of(seen, states)
 
 
-def _given(student_obs: StudentObservation, run: Distilled) -> View:
-    """Return what a caller says that the student of a run sees.
+def given_view(student_obs: StudentObservation, run: Distilled) -> View:
+    """Return what the student of a run sees, where a caller says it too.
+
+    Args:
+        student_obs: What the caller says.
+        run: The run. Of a function that no file holds, only how many numbers it makes is known.
 
     Raises:
         SettingError: If the run says otherwise.
@@ -362,19 +375,16 @@ def _given(student_obs: StudentObservation, run: Distilled) -> View:
     states, seen = run.demonstrations.observations[:256], run.settings["student_obs"]
     n, expected = states.shape[1], run.student.observation_size
     looked = visible(student_obs, n, run.dataset.remembered)
-    view = View.of(looked, states)
-    if isinstance(seen, str):
-        same = view.size == expected
-    else:
-        same = view.columns == ((*range(n),) if run.view.is_whole else run.view.columns)
-    if not same:
+    view, lost = View.of(looked, states), isinstance(run.view.look, Unseen)
+    if view.size != expected or not (lost or sees_as(view, run.view, states)):
+        then = "pass the function of then, or " if isinstance(seen, str) else ""
         raise SettingError(
             f"student_obs is {describe_view(looked, n)}: {view.size} numbers",
             f"{'the whole observation' if seen is None else seen}: {expected} numbers, as the "
             "student was trained",
-            "pass the function of then, or leave student_obs= out",
+            f"{then}leave student_obs= out",
         )
-    return view
+    return view if lost else run.view
 
 
 _COUNTS = {"observation_size", "past", "remembered"}

@@ -19,7 +19,7 @@ GOOD = (
 )
 """What 80 % of the students of nine experts had (benchmarks/figures/fidelity.md)."""
 _DIRECTIONS = 8
-_STILL = float(np.finfo(np.float32).eps)  # of half its range: what varies less is rounding
+_STILL = float(np.finfo(np.float32).eps)  # of an action's unit: what varies less is rounding
 _ROUNDING = 1e-5  # of how actions vary: an expert that changes less does not react
 
 
@@ -68,7 +68,7 @@ def fidelity_of(
         student: (B, n) -> (B, m) actions as the environment takes them.
         expert: The same; rows of NaN are no answer.
         states: (S, n) of the expert's own episodes; it has an answer at some.
-        units: (m,) of the actions that stand still, half their range.
+        units: (m,) of the actions that stand still, from `action_units`.
         scales: Of its states.
         random: Draws directions that nothing was trained on.
         held: Coordinates that nothing moves: choices, flags, whole numbers. Not all of them.

@@ -105,7 +105,7 @@ class Stability:
 
     Attributes:
         sizes: Of the disturbances, the largest that the environment took, in units of half the
-            range of an action.
+            range of an action, or of the expert's deviation where it has none.
         deviations: Largest distance to the undisturbed path, over episodes and disturbances, in
             the expert's standard deviations (root mean square over the coordinates that move),
             while both paths last.
@@ -156,7 +156,7 @@ def stability_of(
         own: (E, T) its undisturbed episodes.
         pool: The environment.
         horizon: T.
-        units: (m,) of actions, half their range.
+        units: (m,) of actions, from `action_units`.
         scales: Of its states.
         seeds: (E,) of the directions of each episode, the same for every size.
         sizes: Of the disturbances.

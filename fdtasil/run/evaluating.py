@@ -57,8 +57,8 @@ def evaluate(
         episodes: Number of paired episodes.
         horizon: Steps after which an episode is cut; default: the environment's time limit.
         seed: Of the starts; those of `distill` with the same seed.
-        student_obs: What the policy sees, as in `distill`; an ONNX file that fdtasil exported
-            says its indices itself.
+        student_obs: What the policy sees, as in `distill`; a result, a run and an ONNX file that
+            fdtasil exported say it themselves, but for a function that no file can hold.
         history: As in `distill`.
         constraints: As in `distill`.
         force: Go on with a warning where the expert fails the gate but answers.
@@ -82,13 +82,13 @@ def evaluate(
     limits = None if constraints is None else check_constraints(constraints)
     history = check_count("history", history)
     policy = finished_run(policy)
-    looked_at, student_obs, history = judged_through(policy, student_obs, history)
-    history = check_history(history, student_obs)
     count, bars = check_count("episodes", episodes), Progress(check_flag("progress", progress))
     with EnvironmentPool(env) as pool, torch_settings(torch.device("cpu")):
         n, m = pool.boxes.observation_size, pool.boxes.action_size
-        black_box, length = expert_in(expert, pool), resolve_horizon(horizon, pool)
         student_obs = named(student_obs, pool.spaces.observations)
+        looked_at, student_obs, history = judged_through(policy, student_obs, history)
+        history = check_history(history, student_obs)
+        black_box, length = expert_in(expert, pool), resolve_horizon(horizon, pool)
         seen_size = view_size(student_obs, n + past_size(history, n, m))
         judged = judged_in(looked_at, pool, seen_size, whole=student_obs is None and history == 1)
         if judged.memory is not None:

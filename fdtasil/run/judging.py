@@ -14,13 +14,20 @@ from fdtasil.experts.load import ExpertLike, open_expert, sized
 from fdtasil.experts.onnx_expert import said_history
 from fdtasil.experts.structure import in_spaces
 from fdtasil.files.run_format import WEIGHTS
-from fdtasil.results.distilled import Distilled
+from fdtasil.results.distilled import Distilled, given_view
 from fdtasil.rollouts.behaviours import Policy
 from fdtasil.rollouts.environments import EnvironmentPool
 from fdtasil.rollouts.spaces import Spaces, flat_layout
 from fdtasil.rollouts.trials import fingerprint, other_environment
 from fdtasil.student.policy import Student
-from fdtasil.student.view import StudentObservation, Unseen, View, visible
+from fdtasil.student.view import (
+    StudentObservation,
+    Unseen,
+    View,
+    describe_view,
+    sees_as,
+    visible,
+)
 
 __all__ = [
     "acting",
@@ -86,11 +93,12 @@ def judged_through(
 
     Args:
         policy: The policy, from `finished_run`.
-        student_obs: What the caller says that it sees, or None.
+        student_obs: What the caller says that it sees, by index; or None.
         history: How many observations the caller says that it sees.
 
     Raises:
-        SettingError: If it is None, or sees through a function that is lost.
+        SettingError: If it is None, sees through a function that is lost, or is a result that
+            sees something else than the caller says.
     """
     if policy is None:
         raise SettingError(
@@ -98,11 +106,13 @@ def judged_through(
         )
     if isinstance(policy, Distilled):
         history = max(history, policy.steps_seen)
-        if history == 1 and student_obs is None and not policy.view.is_whole:
-            student_obs = policy.view.columns or policy.view.look
-            if isinstance(student_obs, Unseen):
-                raise student_obs.lost
-        return policy.student, student_obs, history
+        if history > 1:
+            return policy.student, student_obs, history
+        view = policy.view if student_obs is None else given_view(student_obs, policy)
+        if isinstance(view.look, Unseen):
+            raise view.look.lost
+        seen = None if view.is_whole else view.columns or view.look
+        return policy.student, seen, history
     if history == 1 and student_obs is None:
         history = said_history(policy)
     return policy, student_obs, history
@@ -147,9 +157,9 @@ def acting(
     says = judged.origin.columns
     seen = says if student_obs is None else student_obs
     view = View.of(visible(seen, states.shape[1], remembered), states[:256])
-    if says is not None and view.columns not in (None, says):
+    if says is not None and not sees_as(view, View.of(says, states), states):
         raise SettingError(
-            f"student_obs={list(view.columns or ())} of {judged.name}",
+            f"student_obs={describe_view(student_obs, states.shape[1])} of {judged.name}",
             f"{list(says)}, as the file says itself",
             "leave student_obs= out",
         )

@@ -165,12 +165,17 @@ def export(
         ExportError: If the file's answers differ from the student's by more than 1e-5.
     """
     suffix = next((suffix for suffix in EXPORTS if str(name).endswith(suffix)), None)
-    eight_bits = suffix is not None and suffix.startswith(_INT8)
-    if suffix is None or (_INT8 in Path(name).suffixes and not eight_bits):
+    if suffix is None:
         raise SettingError(
             f"{str(name)!r} to export a student to",
             f"a name that ends with {' or '.join(EXPORTS)}",
             "write for example student.onnx",
+        )
+    if _INT8 in Path(str(name).lower()).suffixes and not suffix.startswith(_INT8):
+        raise SettingError(
+            f"{str(name)!r} to export a student to",
+            f"{_INT8}.onnx or {_INT8}.c at the end, for weights in eight bits",
+            f"write for example student{_INT8}.onnx, or leave {_INT8} out of the name",
         )
     if check_choice("inputs", inputs, ("flat", "keys")) == "flat":
         return EXPORTS[suffix](student, states, metadata)

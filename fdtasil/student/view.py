@@ -15,13 +15,24 @@ from fdtasil.errors import SettingError, first_line
 from fdtasil.probes.answers import Answers
 from fdtasil.rollouts.behaviours import Policy
 
-__all__ = ["StudentObservation", "Unseen", "View", "describe_view", "view_size", "visible"]
+__all__ = [
+    "StudentObservation",
+    "Unseen",
+    "View",
+    "describe_view",
+    "sees_as",
+    "view_size",
+    "visible",
+]
 
 StudentObservation = Sequence[int] | Sequence[str] | Callable[[np.ndarray], np.ndarray]
 """Indices of the coordinates that the student sees, names of parts, or (B, n) -> (B, k)."""
 
 _ROUNDINGS = 4  # of float32, in the difference of two steps
 _SAME = 1e-4  # relative; beyond the rounding of float32, below any nonlinearity worth the name
+
+
+_LEAST_SPREAD = 1e-3  # of a coordinate that does not change
 
 
 def _whole(rows: np.ndarray) -> np.ndarray:
@@ -179,6 +190,14 @@ def _rounding(
     return (_SAME + _ROUNDINGS * lost.max(initial=0.0)) * largest + _ROUNDINGS * own
 
 
+def sees_as(one: View, other: View, states: np.ndarray) -> bool:
+    """Whether two views of (B, n) states, and of states around them, are the same."""
+    spread = np.maximum(states.std(axis=0), _LEAST_SPREAD)
+    noise = np.random.default_rng(0).standard_normal(states.shape) * spread
+    around = np.concatenate([states, (states + noise).astype(states.dtype)])
+    return np.allclose(one.look(around), other.look(around), equal_nan=True)
+
+
 def view_size(student_obs: StudentObservation | None, n: int) -> int | None:
     """Return how many of n coordinates a student sees; None where only asking tells."""
     if student_obs is None:
@@ -271,7 +290,7 @@ def _from_function(given: Callable[[np.ndarray], np.ndarray], states: np.ndarray
             "a function (B, n) -> (B, k) of each row on its own",
             "index or transform the last axis only",
         )
-    spread = np.maximum(states.std(axis=0), 1e-3)
+    spread = np.maximum(states.std(axis=0), _LEAST_SPREAD)
     seen = [
         not np.array_equal(np.asarray(function(states + spread * (np.arange(n) == i))), found)
         for i in range(n)
