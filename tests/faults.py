@@ -353,6 +353,7 @@ FAULTS = {
         332: "a result that is judged through another view than its own",
         333: "a function that sees as a run's indices do, given to load",
         334: "a predict with a state that answers one choice a row",
+        335: "another expert than the one whose probes are stored",
     },
 }
 

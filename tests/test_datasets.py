@@ -604,9 +604,26 @@ def test_a_result_is_judged_through_its_own_function(linear, tmp_path):
 @pytest.mark.fault(233)
 def test_another_expert_than_the_datasets_is_warned_of_in_an_environment_too(run, linear):
     other = lambda rows: 0.5 * linear(rows)  # noqa: E731
-    with pytest.warns(FdtasilWarning, match="otherwise than the demonstrations at 16 of 16"):
+    with pytest.warns(FdtasilWarning, match="otherwise than the demonstrations at 32 of 32"):
         result = fdtasil.distill(other, TOY, dataset=run, **QUICK)
     assert result.queries["check"] == result.report["predicted_queries"]["check"]
+
+
+@pytest.mark.fault(335)
+def test_another_expert_than_stored_probes_is_warned_of(run, linear):
+    """As one that is at its bounds wherever the demonstrations went, and was changed within."""
+    states = fdtasil.Distilled.load(run).demonstrations.observations
+    visited = {row.tobytes() for row in states}
+
+    def other(rows):
+        there = [row.tobytes() in visited for row in np.asarray(rows, np.float32)]
+        return np.where(np.array(there)[:, None], linear(rows), 0.5 * linear(rows))
+
+    for env, about in ((TOY, QUICK), (None, SMALL)):
+        with pytest.warns(FdtasilWarning, match=r"at \d+ of 32 states and states that a probe"):
+            result = fdtasil.distill(other, env, dataset=run, **about)
+        assert result.queries["check"] == result.report["predicted_queries"]["check"]
+    fdtasil.distill(linear, TOY, dataset=run, **QUICK)
 
 
 @pytest.mark.parametrize("asked", [{"horizon": 7}, {"constraints": {"a": lambda x, u: x[:, 0]}}])

@@ -95,6 +95,23 @@ class Dataset:
         n, m = self.sizes
         return (n - self.remembered - (self.history - 1) * m) // self.history
 
+    def around(self, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Return where some states were moved to by their first probe, and what was said there.
+
+        Args:
+            chosen: (S,) numbers of the states.
+
+        Returns:
+            (S, n) and (S, m); both are empty where nothing was asked, or the answers are
+            derivatives.
+        """
+        probes, answers, states = self.probes, self.answers, self.demonstrations
+        if answers is None or probes is None or probes.stencil is None or probes.exact:
+            return states.observations[:0], states.actions[:0]
+        steps = answers.displacements[answers.numbers[chosen, 0]]
+        points = states.observations[chosen] + probes.stencil.offsets[0] * steps
+        return points.astype(np.float32), answers.values[chosen, 0, 0]
+
     def to_bytes(self) -> bytes:
         """Return the dataset as an npz file.
 

@@ -103,7 +103,7 @@ class Collecting:
         chosen = np.linspace(0, len(states) - 1, min(len(states), _ASKED_AGAIN)).astype(int)
         rows, stored = states.observations[chosen], states.actions[chosen]
         # A law at its bounds shows at the states themselves nothing of what it is around them.
-        moved, said = _around(kept.dataset, chosen)
+        moved, said = kept.dataset.around(chosen)
         rows, stored = np.concatenate([rows, moved]), np.concatenate([stored, said])
         answers = self.expert.ask(rows, "check")
         # A planner that found nothing this time is no other expert.
@@ -141,16 +141,3 @@ class Collecting:
         seeds = episode_seeds(self.seed, stream, first, count)
         with self.progress.bar("demonstrations", "step", count * self.horizon) as bar:
             return rollout(behaviour, self.pool, seeds, self.horizon, noise, bar.move)
-
-
-def _around(dataset: Dataset, chosen: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return where some states were moved to by their first probe, and what was said there.
-
-    (S, n) and (S, m); both are empty where nothing was asked, or the answers are derivatives.
-    """
-    probes, answers, states = dataset.probes, dataset.answers, dataset.demonstrations
-    if answers is None or probes is None or probes.stencil is None or probes.stencil.exact:
-        return states.observations[:0], states.actions[:0]
-    steps = answers.displacements[answers.numbers[chosen, 0]]
-    points = states.observations[chosen] + probes.stencil.offsets[0] * steps
-    return points.astype(np.float32), answers.values[chosen, 0, 0]

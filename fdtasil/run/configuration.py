@@ -125,10 +125,10 @@ class Configuration:
             gates = 2 if self.evaluation_episodes else 1
             found["check"] = gates * GATE_QUERIES + self._largest_batch(found)
             found["check"] += self._asked_again
-            found["check"] += GATE_STATES if self.dataset is not None else 0
+            found["check"] += self._compared
             found["evaluate"] = 2 * self.evaluation_episodes * self.horizon
         elif self.expert is not None:  # on the states of a dataset
-            found["check"] = GATE_QUERIES + GATE_STATES
+            found["check"] = GATE_QUERIES + self._compared
         if self.remembered:
             found["check"] += 2 * GATE_STATES  # where episodes begin, with a memory and without
             # Each step of the environment.
@@ -178,6 +178,14 @@ class Configuration:
             return 0
         steps = self.evaluation_episodes * self.horizon
         return steps * (1 + (self.remembered > 0)) + self._asked_again
+
+    @property
+    def _compared(self) -> int:
+        """Rows that an expert is compared with a dataset at: its states, and moved by a probe."""
+        if self.dataset is None:
+            return 0
+        moved = self.probes_given and self.probes is not None and not self.probes.exact
+        return GATE_STATES * (2 if moved else 1)
 
     @property
     def _asked_again(self) -> int:

@@ -387,7 +387,8 @@ def _examined(
     """Lead the expert through the gate; return its episodes where they are compared with."""
     run, expert, pool = rounds.run, subject.expert, subject.pool
     if expert is not None and given is not None:
-        examine_given(expert, given, admit=pool is None, force=force)
+        around = run.probes_given  # else there will be answers of this expert alone
+        examine_given(expert, given, admit=pool is None, around=around, force=force)
     if expert is None or pool is None:
         return None
     starts = episode_seeds(run.seed, "evaluation", 0, run.evaluation_episodes or GATE_STATES)

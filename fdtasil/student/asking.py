@@ -21,12 +21,13 @@ def as_numbers(observation: Any, expected: str, step: str) -> np.ndarray:
     Raises:
         SettingError: If it is something else, or some of it is masked.
     """
+    found = f"an observation that is a {type(observation).__name__}"
     try:
         if np.ma.is_masked(observation):
+            found = "an observation of which some numbers are masked"
             raise ValueError
         return np.asarray(to_numpy(observation), np.float32)
     except (RuntimeError, TypeError, ValueError):  # torch's of a gradient, numpy's
-        found = f"an observation that is a {type(observation).__name__}"
         raise SettingError(found, expected, step) from None
 
 
