@@ -40,11 +40,13 @@ if TYPE_CHECKING:
     from fdtasil.probes.source import Probes
     from fdtasil.results.distilled import Distilled
     from fdtasil.results.evaluation import Evaluation
+    from fdtasil.results.inspection import Inspection
     from fdtasil.rollouts.wanted import Environment
     from fdtasil.run.diagnosing import diagnose
     from fdtasil.run.evaluating import evaluate
     from fdtasil.run.events import Event, Log
     from fdtasil.run.film import render
+    from fdtasil.run.inspecting import inspect
     from fdtasil.run.pipeline import distill
     from fdtasil.run.shrinking import shrink
     from fdtasil.student.architectures import Mlp
@@ -65,6 +67,7 @@ __all__ = [
     "FdtasilWarning",
     "Fit",
     "History",
+    "Inspection",
     "Log",
     "Mlp",
     "NoisyExpert",
@@ -77,6 +80,7 @@ __all__ = [
     "from_arrays",
     "from_minari",
     "gains",
+    "inspect",
     "load_expert",
     "render",
     "shrink",
@@ -96,11 +100,13 @@ _ROOMS = {
     "probes.source": ("Probes",),
     "results.distilled": ("Distilled",),
     "results.evaluation": ("Evaluation",),
+    "results.inspection": ("Inspection",),
     "rollouts.wanted": ("Environment",),
     "run.diagnosing": ("diagnose",),
     "run.events": ("Event", "Log"),
     "run.film": ("render",),
     "run.evaluating": ("evaluate",),
+    "run.inspecting": ("inspect",),
     "run.pipeline": ("distill",),
     "run.shrinking": ("shrink",),
     "student.architectures": ("Mlp",),

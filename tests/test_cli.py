@@ -44,8 +44,10 @@ def expert(tmp_path_factory):
 
 # --- arguments
 
+_OF_ITS_OWN = {"evaluate": {"json"}, "inspect": {"json", "picture"}}
 
-@pytest.mark.parametrize("name", ["distill", "evaluate"])
+
+@pytest.mark.parametrize("name", ["distill", "evaluate", "inspect"])
 def test_the_shell_has_the_functions_arguments_and_defaults(name):
     function = inspect.signature(getattr(fdtasil, name)).parameters
     command = inspect.signature(import_module(f"fdtasil.shell.{name}").command).parameters
@@ -57,7 +59,7 @@ def test_the_shell_has_the_functions_arguments_and_defaults(name):
         "constraints",
     }
     added = {"output", "inputs", "trust", "env_kwargs", "reset_options"}
-    numbers, added = {"num_envs"}, added | ({"json"} if name == "evaluate" else set())
+    numbers, added = {"num_envs"}, added | _OF_ITS_OWN.get(name, set())
     if name == "distill":
         added |= {"out", "baseline", "log_formats"} | SETTINGS
     assert set(command) - set(function) <= added | numbers
