@@ -782,3 +782,50 @@ def test_a_log_beside_an_environment_of_parts_takes_its_form(tmp_path):
     seen = OBSERVATIONS["dictionary"].of(recorded.observations[0])
     assert result.student.predict(seen)[0].shape == (2,)
     assert result.export(tmp_path / "s.onnx", inputs="keys").exists()
+
+
+@pytest.mark.fault(343)
+@pytest.mark.parametrize("kind", [np.uint8, np.uint64, np.int64])
+def test_ends_that_do_not_grow_are_refused_whatever_their_type(kind):
+    states, actions = np.random.default_rng(0).standard_normal((2, 60, 2))
+    with pytest.raises(SettingError, match="growing numbers up to 60"):
+        fdtasil.from_arrays(states, actions, episode_ends=np.array([50, 30, 60], kind))
+    good = fdtasil.from_arrays(states, actions, episode_ends=np.array([30, 50, 60], kind))
+    assert np.bincount(good.demonstrations.episode).tolist() == [30, 20, 10]
+
+
+@pytest.mark.fault(343)
+def test_lists_of_several_lengths_are_refused():
+    states = np.zeros((3, 2))
+    with pytest.raises(SettingError, match="plain numbers"):
+        fdtasil.from_arrays([[1.0], [2.0, 3.0]], states[:2])
+    with pytest.raises(SettingError, match="episode_ends"):
+        fdtasil.from_arrays(states, states, episode_ends=[[1], [2, 3]])
+
+
+def test_no_path_is_refused_by_every_writer(quick):
+    for write in (quick.export, quick.to_onnx, quick.save):
+        with pytest.raises(SettingError, match="None"):
+            write(None)
+
+
+@pytest.mark.fault(350)
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"constraints": {"rail": lambda x, u: x["place"]}}, r"is 0:2 place, 2:4 rest|0:\d \w+, "),
+        ({"constraints": {"rail": lambda x, u: 1.0}}, r"\(2,\) numbers"),
+        ({"student_obs": lambda rows: rows["place"]}, r"raised IndexError on \(2, 5\)"),
+        ({"student_obs": lambda rows: rows.sum(axis=1)}, r"maps \(2, 5\)"),
+    ],
+)
+def test_functions_are_tried_before_the_expert_is_asked(changes, said):
+    asked = []
+
+    def law(parts):
+        asked.append(len(parts["place"]))
+        return np.zeros((len(parts["place"]), 2), np.float32)
+
+    with pytest.raises(SettingError, match=said):
+        fdtasil.distill(law, lambda: InForm("dictionary"), 2, **QUICK, **changes)
+    assert sum(asked) == 0

@@ -3,12 +3,14 @@
 import numpy as np
 import pytest
 from conftest import QUICK, TOY
+from toy_forms import InForm
 
 import fdtasil
 from fdtasil import gains
 from fdtasil.errors import ExpertError, SettingError
 from fdtasil.experts.load import load_expert
 from fdtasil.probes.derivatives import check_derivatives, comparison_rows
+from fdtasil.rollouts.environments import EnvironmentPool
 
 N, M, HIDDEN = 6, 3, 64
 WEIGHTS = [
@@ -285,3 +287,19 @@ def test_one_law_at_its_bounds_takes_nothing_from_the_others():
         found = gains(law, states)
     assert found.jacobian[:, 0, 0] == pytest.approx(0.5, abs=1e-3)
     assert found.error[0].max() < 1e-3
+
+
+@pytest.mark.fault(353)
+def test_an_expert_of_dictionaries_is_asked_in_its_own_form():
+    def law(parts):
+        return np.tanh(parts["place"]) - 0.5 * parts["speed"]
+
+    made = lambda: InForm("dictionary")  # noqa: E731
+    result = fdtasil.distill(law, made, 0, **QUICK)
+    states = result.demonstrations.observations[:3]
+    with EnvironmentPool(made) as pool:
+        place, speed = (list(pool.spaces.observations.columns(one)) for one in ("place", "speed"))
+    found = gains(law, states, env=made)
+    assert np.allclose(found.jacobian[:, [0, 1], speed], -0.5, atol=1e-3)
+    expected = 1 - np.tanh(states[:, place]) ** 2
+    assert np.allclose(found.jacobian[:, [0, 1], place], expected, atol=1e-3)

@@ -161,3 +161,26 @@ def test_a_constant_that_rounds_away_what_moves_is_refused(constant, kept, monke
         with pytest.raises(ExportError, match=r"observation 4 is about 1\.7e") as caught:
             result.to_sb3(_Beside(), "SAC")
         assert "subtract" in caught.value.next_step
+
+
+@pytest.mark.fault(347)
+def test_small_bounds_are_compared_as_they_are():
+    def small(factor):
+        space = gymnasium.spaces.Box(-1e-9 * factor, 1e-9 * factor, (2,), np.float32)
+        made = gymnasium.wrappers.TransformAction(Integrator(), lambda a: a / 1e-9, space)
+        return gymnasium.wrappers.TimeLimit(made, 20)
+
+    result = fdtasil.distill(lambda rows: 1e-9 * law(rows), lambda: small(1), 0, **QUICK)
+    result.to_sb3(small(1), "SAC")
+    with pytest.raises(ExportError, match="a student of actions from"):
+        result.to_sb3(small(5), "SAC")
+
+
+@pytest.mark.fault(347)
+def test_an_environment_of_a_refused_agent_is_closed(monkeypatch):
+    closed = []
+    monkeypatch.setattr(DummyVecEnv, "close", lambda self: closed.append(self))
+    result = fdtasil.distill(law, TOY, 0, **QUICK)
+    with pytest.raises(ExportError, match="from"):
+        result.to_sb3("Pendulum-v1", "SAC")
+    assert len(closed) == 1

@@ -470,3 +470,9 @@ def test_a_memory_behind_observations_of_unknown_length_is_refused():
     with pytest.raises(ExpertError, match="nobody says how long") as caught:
         load_expert(OfAnyLength()).ask(np.zeros((2, N)), "check")
     assert "observation_size=n" in caught.value.next_step
+
+
+@pytest.mark.fault(350)
+def test_a_function_beside_a_memory_is_told_of_its_own_shape():
+    with pytest.raises(SettingError, match=r"raised IndexError on \(2, 5\) observations"):
+        fdtasil.distill(Remembers(), TOY, 0, student_obs=lambda rows: rows["place"], **QUICK)

@@ -240,3 +240,23 @@ def test_an_environment_with_options_is_made_again_by_its_card(made, code):
     again = {}
     exec(call.replace("expert = ...", "expert = swing"), {"swing": swing}, again)
     assert again["result"].student.to_bytes() == result.student.to_bytes()
+
+
+@pytest.mark.fault(351)
+def test_the_call_of_the_card_imports_the_module_of_an_environment(linear):
+    result = fdtasil.distill(linear, TOY, 0, **QUICK)
+    assert f"    {TOY!r},\n" in call_of(result.settings, 1)
+    walled = "toy_environments:toy/Walled-v0"
+    made = fdtasil.Environment(walled, reset_options={"a": 1})
+    result = fdtasil.distill(linear, made, 0, **QUICK)
+    told = f"fdtasil.Environment({walled!r}, reset_options={{'a': 1}})"
+    assert told in call_of(result.settings, 1)
+
+
+def test_the_call_of_the_card_forces_what_was_forced(linear):
+    def wild(rows):
+        return 9 * linear(rows)
+
+    with pytest.warns(FdtasilWarning, match="forced"):
+        result = fdtasil.distill(wild, TOY, 0, force=True, **QUICK)
+    assert "force=True" in call_of(result.settings, 1)

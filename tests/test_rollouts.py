@@ -6,7 +6,7 @@ import gymnasium
 import numpy as np
 import pytest
 from conftest import GAIN, TOY
-from toy_environments import Integrator
+from toy_environments import Integrator, Jumps
 
 from fdtasil.errors import EnvironmentFault, FdtasilWarning, SettingError
 from fdtasil.rollouts.behaviours import Decision, farthest_apart, follow, random_behaviour
@@ -144,18 +144,6 @@ def test_an_environment_that_can_not_be_used_is_described(environment, found):
 
 @pytest.mark.fault(76)
 def test_a_silent_physics_reset_is_counted():
-    class Data:
-        time = 0.0
-
-    class Jumps(Integrator):
-        def __init__(self):
-            super().__init__()
-            self.data = Data()
-
-        def step(self, action):
-            self.data.time = 0.0 if self.data.time > 0.45 else self.data.time + 0.1
-            return super().step(action)
-
     with pytest.warns(FdtasilWarning, match="reset itself in 1 of 1 episodes"):
         assert run(Jumps, [0], horizon=12).physics_resets.tolist() == [2]
 

@@ -12,9 +12,9 @@ import pytest
 from conftest import GAIN, QUICK, TOY, mlp_onnx
 
 import fdtasil
-from fdtasil.errors import ExpertError, FdtasilWarning, SettingError
+from fdtasil.errors import ExpertError, FdtasilWarning, FitError, SettingError
 from fdtasil.results.shrunk import Candidate
-from fdtasil.run.elsewhere import side_by_side
+from fdtasil.run.elsewhere import elsewhere, side_by_side
 
 pytestmark = pytest.mark.usefixtures("no_pictures")
 SIZES = [(2,), (16, 16)]
@@ -98,7 +98,10 @@ def test_side_by_side_they_are_the_same(tmp_path):
 
 @pytest.mark.parametrize(
     "wrong",
-    [{"keep": 2.0}, {"sizes": []}, {"activations": ["gellu"]}, {"workers": 2}, {"sizes": [(0,)]}],
+    [
+        *({"keep": 2.0}, {"activations": ["gellu"]}, {"workers": 2}),
+        *({"sizes": sizes} for sizes in ([], [(0,)], 8, (64, 64), "ab")),
+    ],
 )
 def test_what_can_not_be_shrunk(run, wrong):
     with pytest.raises(SettingError):
@@ -135,6 +138,7 @@ def test_another_call_in_the_same_folder_is_refused(run, tmp_path):
 
 
 @pytest.mark.fault(257)
+@pytest.mark.fault(352)
 def test_a_killed_one_goes_on(run, tmp_path, monkeypatch):
     """Within a student's training, and to the same bytes."""
     options = {**FAST, "fit": fdtasil.Fit(steps=300), "cloned": False, "keep": 0.0}
@@ -142,8 +146,10 @@ def test_a_killed_one_goes_on(run, tmp_path, monkeypatch):
     monkeypatch.setattr("fdtasil.run.folder.CHECKPOINT_SECONDS", 0.0)
     with monkeypatch.context() as patched:
         patched.setattr("fdtasil.run.pipeline.evaluate_pair", _interrupt)
-        with pytest.raises(KeyboardInterrupt):
+        with pytest.raises(KeyboardInterrupt) as killed:
             fdtasil.shrink(run, law, TOY, **options, out=tmp_path / "killed")
+    (note,) = killed.value.__notes__
+    assert note.endswith("killed: the same call again goes on with it")
     again = fdtasil.shrink(run, law, TOY, **options, out=tmp_path / "killed")
     assert [one.ci95 for one in again.candidates] == [one.ci95 for one in whole.candidates]
     parts = [(tmp_path / f / "2-relu" / "student.onnx").read_bytes() for f in ("whole", "killed")]
@@ -261,3 +267,38 @@ def test_another_environment_than_the_runs_is_told_of(linear):
     small = {"sizes": [(4,)], "fit": fdtasil.Fit(steps=5), "evaluation_episodes": 2}
     with pytest.warns(FdtasilWarning, match="distilled in another Pendulum-v1"):
         fdtasil.shrink(result, swing, "Pendulum-v1", keep=0.01, progress=False, **small)
+
+
+@pytest.mark.fault(344)
+def test_nobody_to_judge_by_is_refused_at_once(run):
+    for expert, env in ((None, TOY), (law, None)):
+        with pytest.raises(SettingError, match="to judge students with"):
+            fdtasil.shrink(run, expert, env, **FAST)
+
+
+@pytest.mark.fault(349)
+def test_students_are_trained_as_the_runs_was(run):
+    fit = fdtasil.Fit(epochs=2, weight=0.1, batch_size=50, learning_rate=0.002)
+    one = fdtasil.distill(law, TOY, 2, **{**QUICK, "fit": fit})
+    options = {**FAST, "sizes": [(3,)], "cloned": False, "keep": 0.0}
+    found = fdtasil.shrink(one, law, TOY, **options)
+    assert found.result.settings["fit"] == one.settings["fit"]
+    usual = fdtasil.distill(law, TOY, 2, **{**QUICK, "fit": None})
+    written = fdtasil.shrink(usual, law, TOY, **options, fit=None).result.settings["fit"]
+    assert written == usual.settings["fit"]
+
+
+@pytest.mark.fault(345)
+def test_what_can_not_be_sent_is_said_before_anything_is_trained(run, tmp_path):
+    expert = str(mlp_onnx(tmp_path / "e.onnx"))
+    env = fdtasil.Environment(TOY, reset_options={"f": lambda: 0})
+    with pytest.raises(SettingError, match="can't be sent"):
+        fdtasil.shrink(run, expert, env, **FAST, workers=2)
+
+
+@pytest.mark.fault(345)
+def test_a_process_that_ends_before_it_is_called_is_named(monkeypatch):
+    monkeypatch.setattr("fdtasil.run.elsewhere.sys.executable", "/bin/false")
+    with elsewhere("the student", len, bytes(2**24)) as call, pytest.raises(FitError) as ended:
+        call.outcome()
+    assert "the student ended with code 1" in str(ended.value)

@@ -1,5 +1,6 @@
 """Roughness of actions: known signals have known values."""
 
+import tracemalloc
 from dataclasses import replace
 
 import gymnasium
@@ -9,8 +10,10 @@ from conftest import QUICK
 from toy_forms import InForm, in_form
 
 import fdtasil
+from fdtasil.probes.scales import measure_scales
 from fdtasil.results.smoothness import smoothness_of
-from fdtasil.rollouts.behaviours import Decision
+from fdtasil.results.stability import distances
+from fdtasil.rollouts.behaviours import Decision, follow
 from fdtasil.rollouts.environments import EnvironmentPool
 from fdtasil.rollouts.rollout import rollout
 
@@ -135,3 +138,24 @@ def test_a_mixed_action_is_as_rough_as_its_parts():
         found = fdtasil.evaluate(law, law, made, episodes=2, progress=False)
         assert found.roughness == pytest.approx(rough)
         assert found.high_frequency == (fast if fast is None else pytest.approx(fast))
+
+
+@pytest.mark.fault(346)
+def test_a_horizon_far_beyond_what_is_played_costs_no_memory():
+    brief = lambda: gymnasium.wrappers.TimeLimit(InForm(), 10)  # noqa: E731
+    idle, push = (
+        follow(lambda rows, push=push: np.full((len(rows), 2), push, np.float32))
+        for push in (0.0, 0.5)
+    )
+    found = []
+    with EnvironmentPool(brief) as pool:
+        for horizon in (10, 100_000):
+            theirs, ours = (rollout(one, pool, [1, 2], horizon) for one in (idle, push))
+            scales = measure_scales(theirs.observations[theirs.valid])
+            tracemalloc.start()
+            rough = smoothness_of(ours, pool, theirs)
+            found.append((distances(theirs, ours, scales).tolist(), rough))
+            _, peak = tracemalloc.get_traced_memory()
+            tracemalloc.stop()
+    assert found[0] == found[1]
+    assert peak < 40 * 2 * 100_000  # a few numbers for each step, however long observations are

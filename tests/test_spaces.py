@@ -15,6 +15,7 @@ from toy_forms import ACTIONS, OBSERVATIONS, InForm, in_form
 import fdtasil
 from fdtasil.errors import EnvironmentFault, ExpertError, ExportError, SettingError
 from fdtasil.results.distilled import Distilled
+from fdtasil.rollouts.environments import EnvironmentPool
 from fdtasil.rollouts.spaces import Layout, Spaces, layout_of
 
 pytestmark = pytest.mark.usefixtures("no_pictures")
@@ -468,3 +469,18 @@ def test_a_result_is_judged_as_it_is():
     expert, env = in_form(law, "dictionary"), lambda: InForm("dictionary")
     judged = fdtasil.evaluate(result, expert, env, episodes=2, horizon=20)
     assert judged.student_returns == pytest.approx(result.evaluation.student_returns)
+
+
+@pytest.mark.fault(348)
+def test_clip_action_hides_no_bounds_of_a_matrix():
+    class Matrix(InForm):
+        def __init__(self):
+            super().__init__()
+            self.action_space = gymnasium.spaces.Box(-0.5, 0.5, (2, 1), np.float32)
+
+        def step(self, action):
+            return super().step(np.asarray(action).reshape(2))
+
+    with EnvironmentPool(lambda: gymnasium.wrappers.ClipAction(Matrix())) as pool:
+        assert pool.boxes.low.tolist() == [-0.5, -0.5]
+        assert pool.boxes.high.tolist() == [0.5, 0.5]

@@ -1,8 +1,13 @@
 """Who acts in round i."""
 
+import functools
+from dataclasses import dataclass
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 from conftest import GAIN, QUICK, TOY
+from toy_environments import Integrator
 
 import fdtasil
 from fdtasil.demonstrations.trainers import (
@@ -15,6 +20,8 @@ from fdtasil.demonstrations.trainers import (
 )
 from fdtasil.errors import FdtasilWarning, SettingError
 from fdtasil.experts.load import load_expert
+from fdtasil.results.summary import call_of
+from fdtasil.rollouts.behaviours import Decision
 from fdtasil.rollouts.environments import EnvironmentPool
 from fdtasil.rollouts.rollout import rollout
 
@@ -206,3 +213,126 @@ def test_what_happened_is_counted_over_all_rounds():
     run = {**QUICK, "episodes": 3, "trainer": DAgger(updates=(1, 2), beta=1.0), "force": True}
     result = fdtasil.distill(lambda rows: -2 * np.sign(rows[:, :2]), TOY, 0, **run)
     assert result.report["clipped_actions"] == len(result.demonstrations) == 60
+
+
+@pytest.mark.fault(338)
+def test_noise_stays_in_the_episodes_that_it_is_for():
+    """Others are recorded in the place of those that fell, of which the noisy ones are more."""
+
+    class Slips(Integrator):
+        """Falls from most starts, where it is pushed otherwise than the law pushes."""
+
+        def step(self, action):
+            law = np.clip(linear(self._observe()[None].astype(np.float32))[0], -1, 1)
+            pushed = bool(np.abs(np.asarray(action) - law).max() > 1e-3)
+            *found, fallen, cut, about = super().step(action)
+            return *found, fallen or (pushed and self.position[0] > 0.5), cut, about
+
+    made = lambda: Slips()  # noqa: E731
+    about = QUICK | {"episodes": 12, "horizon": 20, "trainer": "noise", "keep": "survivors"}
+    result = fdtasil.distill(linear, made, 0, **about)
+    assert result.report["replaced_episodes"] > 0
+    states = result.demonstrations
+    apart = np.abs(states.taken - states.actions).max(axis=1) > 1e-3
+    noisy = [bool(apart[states.episode == number].any()) for number in range(12)]
+    assert noisy == [number % 2 == 0 for number in range(12)]
+
+
+@pytest.mark.fault(339)
+def test_an_expert_that_is_silent_in_extra_episodes_gives_no_noise():
+    situation = Situation(1, load_expert(linear, 5, 2), HALF, linear, lambda *_: SILENT)
+    with pytest.warns(FdtasilWarning, match="no answer in the 5 extra episodes"):
+        behaviour = Dart().behaviour(situation)
+    decision = behaviour(ROWS[:3], [np.random.default_rng(e) for e in range(3)])
+    assert np.array_equal(decision.action, linear(ROWS[:3]))
+
+
+SILENT = SimpleNamespace(
+    answered=np.zeros((5, 20), bool),
+    observations=np.zeros((5, 20, 5), np.float32),
+    expert_actions=np.zeros((5, 20, 2), np.float32),
+)
+
+
+@pytest.mark.fault(340)
+def test_a_share_that_is_a_function_is_known_by_what_it_says(tmp_path):
+    def begun(share, folder):
+        run = QUICK | {"trainer": DAgger(updates=(1,), beta=share)}
+        with pytest.raises(StopEarly):
+            fdtasil.distill(linear, TOY, 0, out=tmp_path / folder, callback=stop, **run)
+
+    def stop(event):
+        raise StopEarly
+
+    begun(lambda round_: 0.7**round_, "run")
+    other = DAgger(updates=(1,), beta=lambda round_: 0.0)
+    with pytest.raises(SettingError, match="trainer was"):
+        fdtasil.distill(linear, TOY, 0, resume=tmp_path / "run", **QUICK, trainer=other)
+    same = DAgger(updates=(1,), beta=functools.partial(pow, 0.7))
+    found = fdtasil.distill(linear, TOY, 0, resume=tmp_path / "run", **QUICK, trainer=same)
+    assert found.report["trainer"] == "dagger,updates=(1,),beta=[0.7]"
+    call = call_of(found.settings, 1)
+    assert "beta=lambda round_: [0.7][round_ - 1]" in call
+    names = {"expert": linear}
+    exec(call.replace("expert = ...", ""), names)
+    assert names["result"].student.to_bytes() == found.student.to_bytes()
+
+
+class StopEarly(Exception):
+    pass
+
+
+class Own:
+    """A trainer of somebody's own, with a matrix and a generator."""
+
+    name = "own"
+
+    def __init__(self, rounds=None, decision=None):
+        self.covariance, self.random = np.eye(2), np.random.default_rng(0)
+        self.given, self.decision = rounds, decision
+
+    def rounds(self, episodes):
+        return [episodes] if self.given is None else self.given
+
+    def behaviour(self, situation):
+        def act(observations, noise):
+            answers = situation.expert.ask(observations, "act")
+            return Decision(answers, answers) if self.decision is None else self.decision(answers)
+
+        return act
+
+    def queries(self, episodes, horizon):
+        return {"act": episodes * horizon, "label": 0}
+
+
+@dataclass(slots=True)
+class Slots:
+    name: str = "slots"
+    rounds = Own.rounds
+    given = None
+    decision = None
+    behaviour, queries = Own.behaviour, Own.queries
+
+
+@pytest.mark.fault(341)
+@pytest.mark.parametrize("made", [Own, Slots])
+def test_a_trainer_of_ones_own(made):
+    found = fdtasil.distill(linear, TOY, 0, trainer=made(), **QUICK)
+    expected = fdtasil.distill(linear, TOY, 0, **QUICK)
+    assert found.student.to_bytes() == expected.student.to_bytes()
+    assert " at 0x" not in found.report["trainer"]
+    assert "\n" not in found.report["trainer"]
+
+
+@pytest.mark.fault(341)
+@pytest.mark.parametrize("rounds", [[], [0, 2], [2, 0], [4], [1.5, 0.5], 2])
+def test_rounds_that_are_none_are_refused(rounds):
+    with pytest.raises(SettingError, match=r"rounds\(2\) of the trainer own is"):
+        fdtasil.distill(linear, TOY, 0, trainer=Own(rounds), **QUICK)
+
+
+@pytest.mark.fault(341)
+@pytest.mark.parametrize("decision", [lambda a: a, lambda a: (a, a), lambda a: None])
+def test_what_is_no_decision_is_refused(decision):
+    with pytest.raises(SettingError, match="a trainer's behaviour that returns a"):
+        fdtasil.distill(linear, TOY, 0, trainer=Own(decision=decision), **QUICK)

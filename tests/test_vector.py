@@ -1,5 +1,6 @@
 """Environments that step together: the same demonstrations as from single ones."""
 
+import multiprocessing
 import warnings
 
 import gymnasium
@@ -14,15 +15,18 @@ from stable_baselines3.common.vec_env import (
     VecFrameStack,
     VecNormalize,
 )
+from toy_environments import Jumps
 from toy_forms import InForm, in_form
 
 import fdtasil
 from fdtasil.errors import EnvironmentFault, FdtasilWarning
+from fdtasil.rollouts import vector
 from fdtasil.rollouts.behaviours import follow, random_behaviour
 from fdtasil.rollouts.environments import EnvironmentPool
 from fdtasil.rollouts.rollout import rollout
 
 pytestmark = pytest.mark.usefixtures("no_pictures")
+MODES = (AutoresetMode.NEXT_STEP, AutoresetMode.SAME_STEP, AutoresetMode.DISABLED)
 ARRAYS = ("observations", "actions", "rewards", "valid", "terminated", "seeds")
 
 
@@ -162,10 +166,10 @@ def test_a_simulator_with_tensors_and_one_seed():
 
 
 def test_an_own_vector_environment_is_not_closed():
-    vector = sync(AutoresetMode.NEXT_STEP)
-    first, second = (fdtasil.distill(law, vector, 2, **QUICK) for _ in range(2))
+    own = sync(AutoresetMode.NEXT_STEP)
+    first, second = (fdtasil.distill(law, own, 2, **QUICK) for _ in range(2))
     assert first.dataset.to_bytes() == second.dataset.to_bytes()
-    assert not vector.closed
+    assert not own.closed
 
 
 def test_frames_stacked_by_stable_baselines3():
@@ -175,6 +179,47 @@ def test_frames_stacked_by_stable_baselines3():
     assert result.demonstrations.observations.shape[1] == 15
     first = result.demonstrations.observations[0]
     assert not first[:10].any()  # each episode begins with an empty stack
+
+
+@pytest.mark.fault(336)
+@pytest.mark.parametrize(
+    "kind",
+    [
+        *(lambda mode=mode: SyncVectorEnv([Jumps] * 2, autoreset_mode=mode) for mode in MODES),
+        lambda: DummyVecEnv([Jumps] * 2),
+        fdtasil.Environment("toy_environments:toy/Jumps-v0", num_envs=2),
+    ],
+)
+def test_a_silent_physics_reset_is_counted_in_each(kind):
+    idle = follow(lambda rows: np.zeros((len(rows), 2), np.float32))
+    with (
+        EnvironmentPool(kind) as pool,
+        EnvironmentPool(Jumps) as alone,
+        pytest.warns(FdtasilWarning, match="reset itself in 3 of 3 episodes"),
+    ):
+        found, expected = (rollout(idle, one, [1, 2, 3], 12) for one in (pool, alone))
+    assert found.physics_resets.tolist() == expected.physics_resets.tolist() == [2, 2, 2]
+
+
+@pytest.mark.fault(337)
+def test_processes_of_environments_end_with_one_of_them():
+    begun = set(multiprocessing.active_children())
+    exits = fdtasil.Environment("toy_environments:toy/Exits-v0", num_envs=3)
+    with pytest.raises(EnvironmentFault, match="one of its processes has ended"):
+        fdtasil.distill(law, exits, 0, **QUICK)
+    assert set(multiprocessing.active_children()) <= begun
+
+
+@pytest.mark.fault(337)
+def test_processes_of_environments_end_where_one_hangs(monkeypatch):
+    monkeypatch.setattr(vector, "_PATIENCE", 0.5)
+    begun = set(multiprocessing.active_children())
+    hangs = fdtasil.Environment("toy_environments:toy/Sleeps-v0", num_envs=2)
+    with EnvironmentPool(hangs) as pool:
+        pool.together.reset([0, 1], None)
+        pool.together._env.unwrapped.step_async(np.zeros((2, 2), np.float32))
+        assert len(set(multiprocessing.active_children()) - begun) == 2
+    assert set(multiprocessing.active_children()) <= begun
 
 
 @pytest.mark.fault(217)
@@ -201,9 +246,9 @@ def test_what_an_environment_raises_is_named():
         def step(self, action):
             raise RuntimeError("no more")
 
-    vector = lambda: SyncVectorEnv([Breaks, Breaks])  # noqa: E731
+    breaks = lambda: SyncVectorEnv([Breaks, Breaks])  # noqa: E731
     with pytest.raises(EnvironmentFault, match=r"step\(\) raised RuntimeError: no more"):
-        fdtasil.distill(law, vector, 2, **QUICK)
+        fdtasil.distill(law, breaks, 2, **QUICK)
 
 
 def test_copies_in_processes():

@@ -1,5 +1,8 @@
 """A small environment for the tests, registered under toy/..."""
 
+import os
+import time
+
 import gymnasium
 import numpy as np
 
@@ -37,3 +40,40 @@ class Integrator(gymnasium.Env):
 gymnasium.register("toy/Integrator-v0", entry_point=Integrator, max_episode_steps=40)
 gymnasium.register("toy/Walled-v0", entry_point=lambda: Integrator(0.9), max_episode_steps=40)
 gymnasium.register("toy/Endless-v0", entry_point=Integrator)
+
+
+class Jumps(Integrator):
+    """Its simulation, as MuJoCo's, begins anew at every sixth step, and says so by its clock."""
+
+    class Data:
+        time = 0.0
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.data = Jumps.Data()
+
+    def step(self, action):
+        self.data.time = 0.0 if self.data.time > 0.45 else self.data.time + 0.1
+        return super().step(action)
+
+
+gymnasium.register("toy/Jumps-v0", entry_point=Jumps, max_episode_steps=40)
+
+
+class Hangs(Integrator):
+    """Ends its process, or never returns, where the first position says so."""
+
+    how = "exit"
+
+    def step(self, action):
+        if self.position[0] > 0:
+            os._exit(3) if self.how == "exit" else time.sleep(3600)
+        return super().step(action)
+
+
+class Sleeps(Hangs):
+    how = "sleep"
+
+
+gymnasium.register("toy/Exits-v0", entry_point=Hangs, max_episode_steps=40)
+gymnasium.register("toy/Sleeps-v0", entry_point=Sleeps, max_episode_steps=40)

@@ -159,7 +159,8 @@ def to_minari(dataset: Dataset, dataset_id: str, **about: str) -> "minari.Minari
     buffer: Any = importlib.import_module("minari.data_collector").EpisodeBuffer
     states, n = dataset.demonstrations, dataset.sizes[0]
     buffers = []
-    for number in np.unique(states.episode):
+    # Minari counts without a gap; a run leaves out episodes that its expert had no answer in.
+    for place, number in enumerate(np.unique(states.episode)):
         rows = np.flatnonzero(states.episode == number)
         steps, doubled = len(rows), np.append(rows, rows[-1])
         infos: dict[str, Any] = {EXPERT_ACTION: states.actions[doubled]}
@@ -168,7 +169,7 @@ def to_minari(dataset: Dataset, dataset_id: str, **about: str) -> "minari.Minari
             infos[VALUES] = dataset.answers.values[doubled]
         buffers.append(
             buffer(
-                id=int(number),
+                id=place,
                 observations=states.observations[doubled],
                 actions=states.taken[rows],
                 rewards=states.rewards[rows].tolist(),

@@ -119,7 +119,10 @@ def _joined(
 
 
 def _numbers(name: str, given: Any) -> np.ndarray:
-    found = to_numpy(given)
+    try:
+        found = to_numpy(given)
+    except ValueError:  # numpy's, of lists of several lengths
+        found = np.array(None)
     if found.dtype.kind in "biuf" and not np.ma.is_masked(given):
         return found
     raise SettingError(f"{name} of {found.dtype}", "an array of plain numbers", "convert them")
@@ -139,13 +142,17 @@ def _episodes(ends: Any, count: int) -> np.ndarray:
     """Return (N,) int32, the episode of each state."""
     if ends is None:
         return np.zeros(count, np.int32)
-    given = np.asarray(ends)
-    listed = in_one_line(np.array2string(given, threshold=6))
+    try:
+        given = np.asarray(ends)
+    except ValueError:  # lists of several lengths
+        given = np.zeros((0, 0))
+    listed = in_one_line(np.array2string(given, threshold=6) if given.size else shown(ends))
     said, flags = f"episode_ends={listed}", given.dtype == bool
     if flags and given.shape == (count,):
         given = np.flatnonzero(given) + 1
-    good = given.ndim == 1 and given.size > 0 and given.dtype.kind in "iu"
-    if not good or given[0] < 1 or given[-1] > count or not (np.diff(given) > 0).all():
+    # Compared one by one: differences of unsigned numbers are never negative.
+    grow = given.ndim == 1 and given.dtype.kind in "iu" and bool((given[1:] > given[:-1]).all())
+    if not grow or not given.size or given[0] < 1 or given[-1] > count:
         raise SettingError(
             said,
             f"({count},) True at the last state of each episode, or growing numbers up to {count}",

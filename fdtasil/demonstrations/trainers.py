@@ -1,14 +1,16 @@
 """Who acts in round i: that is all a trainer is."""
 
+import operator
+import re
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields, is_dataclass
 from itertools import pairwise
 from typing import Any, Literal, Protocol
 
 import numpy as np
 
 from fdtasil.checks import check_choice, check_count, check_number, check_share, spelt
-from fdtasil.errors import SettingError
+from fdtasil.errors import SettingError, in_one_line, shown, warn
 from fdtasil.experts.expert import Expert
 from fdtasil.rollouts.behaviours import Behaviour, Decision, Policy, has_none, silent_rows
 from fdtasil.rollouts.episodes import Episodes
@@ -23,9 +25,11 @@ __all__ = [
     "Trainer",
     "check_choices",
     "describe_trainer",
+    "rounds_of",
     "trainer_of",
 ]
 
+_ADDRESS = re.compile(r" at 0x[0-9A-Fa-f]+")
 UPDATES = (1, 5, 20, 30)
 """Trajectories after which the paper's DAgger and DART train anew (TaSIL, appendix)."""
 
@@ -42,6 +46,8 @@ class Situation:
         record: Behaviour and number of episodes -> that many extra episodes of the round, which
             are not labelled; their expert rows count.
         chooses: Whether actions are scores of choices.
+        places: Of the episodes that are played, in the round: others, recorded in the place of
+            some, take over what those were for. None for all of them in turn.
     """
 
     round: int
@@ -50,6 +56,7 @@ class Situation:
     student: Policy | None
     record: Callable[[Behaviour, int], Episodes]
     chooses: bool = False
+    places: Sequence[int] | None = None
 
 
 class Trainer(Protocol):
@@ -205,6 +212,12 @@ class Dart:
         """Return the (m, m) square root of the noise's covariance."""
         episodes = situation.record(_expert_acts(situation.expert), self.extra)
         answered = episodes.answered
+        if not answered.any():
+            warn(
+                f"the expert has no answer in the {self.extra} extra episodes of round "
+                f"{situation.round}, which measure the student's error: no noise is added there"
+            )
+            return np.zeros((len(situation.half_range),) * 2)
         states = episodes.observations[answered]
         errors = (student(states) - episodes.expert_actions[answered]).astype(np.float64)
         covariance = errors.T @ errors / len(errors)
@@ -238,12 +251,14 @@ class NoisyExpert:
         """The expert, noisy in the first episode and every second one after it; labels are not."""
         expert, spread = situation.expert, self.sigma * situation.half_range
         numbers: dict[np.random.Generator, int] = {}  # of episodes, by their own generator
+        places = situation.places
 
         def act(observations: np.ndarray, noise: Sequence[np.random.Generator]) -> Decision:
             answers = expert.ask(observations, "act")
             actions = answers.copy()
             for row, random in enumerate(noise):
-                if numbers.setdefault(random, len(numbers)) % 2 == 0:
+                number = numbers.setdefault(random, len(numbers))
+                if (number if places is None else places[number]) % 2 == 0:
                     actions[row] += spread * random.standard_normal(len(spread))
             return Decision(actions, answers, silent_rows(answers))
 
@@ -316,16 +331,48 @@ def check_choices(trainer: Trainer) -> None:
         )
 
 
-def describe_trainer(trainer: Trainer) -> str:
-    """Return a trainer's name, and its settings where they are not the usual ones."""
-    fields = vars(trainer).items()
-    usual = vars(TRAINERS[trainer.name]()) if trainer.name in TRAINERS else {}
-    odd = [
-        f"{name}={getattr(value, '__name__', repr(value))}"
-        for name, value in fields
-        if usual.get(name) != value
-    ]
+def describe_trainer(trainer: Trainer, rounds: int) -> str:
+    """Return a trainer's name, and its settings where they are not the usual ones.
+
+    Args:
+        trainer: The trainer.
+        rounds: Of the run: a share that is a function is known by what it says of them.
+    """
+    settings = _settings(trainer)
+    if isinstance(trainer, DAgger) and callable(trainer.beta):
+        settings["beta"] = str([trainer.share(round_) for round_ in range(1, rounds)])
+    usual = _settings(TRAINERS[trainer.name]()) if trainer.name in TRAINERS else {}
+    odd = [f"{name}={told}" for name, told in settings.items() if usual.get(name) != told]
     return ",".join([trainer.name, *odd])
+
+
+def _settings(trainer: Trainer) -> dict[str, str]:
+    """Return a trainer's attributes as texts, without addresses in memory."""
+    slots = [field.name for field in fields(trainer)] if is_dataclass(trainer) else []
+    values = {name: getattr(trainer, name) for name in slots} | getattr(trainer, "__dict__", {})
+    texts = {name: getattr(one, "__name__", None) or repr(one) for name, one in values.items()}
+    texts.pop("name", None)
+    return {name: _ADDRESS.sub("", in_one_line(text)) for name, text in texts.items()}
+
+
+def rounds_of(trainer: Trainer, episodes: int) -> list[int]:
+    """Return the number of episodes of each round of a trainer.
+
+    Raises:
+        SettingError: If they do not make up all episodes.
+    """
+    given: Any = trainer.rounds(episodes)
+    try:
+        rounds = [operator.index(count) for count in given]
+    except TypeError:
+        rounds = []
+    if not rounds or min(rounds) < 1 or sum(rounds) != episodes:
+        raise SettingError(
+            f"rounds({episodes}) of the trainer {shown(trainer.name)} is {shown(given)}",
+            f"the episodes of each round, 1 at least, {episodes} in all",
+            f"return for example [1, {episodes - 1}]" if episodes > 1 else "return [1]",
+        )
+    return rounds
 
 
 def trainer_of(trainer: Any) -> Trainer:

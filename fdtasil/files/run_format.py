@@ -40,9 +40,9 @@ CARD = "README.md"
 """What people complete by hand: a licence, whom to ask."""
 _STAMP = {"format": FORMAT, "made_by": "fdtasil"}
 _OURS_LIMIT = 2**24
-FREE = ("max_queries", "reason", "made", "opened")
+FREE = ("max_queries", "reason", "made", "opened", "force")
 """Parts of a configuration that may be others when a run goes on: what it may ask changes none of
-its bytes, and words say what a fingerprint, and the expert's own answers, tell."""
+its bytes, nor does a gate; words say what a fingerprint, and the expert's own answers, tell."""
 _SURROUNDINGS = ("versions", "device", "expert")  # which may be others too, with a warning
 _UNFINISHED_FILE = re.compile(r"\.[\w.]+\.\d+\.[0-9a-f]{8}\.tmp", re.ASCII)
 

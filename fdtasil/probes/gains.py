@@ -6,9 +6,11 @@ import numpy as np
 
 from fdtasil.checks import check_count, spelt
 from fdtasil.errors import SettingError, warn
+from fdtasil.experts.carrying import carry
 from fdtasil.experts.expert import Expert
-from fdtasil.experts.load import ExpertLike, load_expert
+from fdtasil.experts.load import ExpertLike, expert_in, load_expert
 from fdtasil.probes.scales import least_steps, measure_scales
+from fdtasil.rollouts.environments import EnvironmentLike, EnvironmentPool
 
 __all__ = ["Gains", "gain_rows", "gains"]
 
@@ -93,6 +95,7 @@ def gains(
     expert: ExpertLike,
     states: np.ndarray,
     *,
+    env: EnvironmentLike | None = None,
     scale: np.ndarray | None = None,
     seed: int = 0,
 ) -> Gains:
@@ -105,7 +108,9 @@ def gains(
 
     Args:
         expert: As in `load_expert`.
-        states: (N, n) observations; of an opened expert with a memory, with that behind them.
+        states: (N, n) observations; of an expert with a memory, with that behind them.
+        env: Its environment, as in `distill`: of an expert that takes dictionaries or gives
+            choices, or that has a memory and is not opened.
         scale: (n,) by how much each coordinate usually differs; measured over the states if left
             out, and 1 where they are a single one or do not differ.
         seed: Of the ladder's states and coordinates.
@@ -125,6 +130,10 @@ def gains(
         (array([[[1., 0.]]]), True)
     """
     rows = _checked(states)
+    if env is not None:
+        with EnvironmentPool(env) as pool:
+            expert, _, _ = carry(expert_in(expert, pool), pool)
+            return gains(expert, rows, scale=scale, seed=seed)
     units = _units(rows, scale)
     # One with a memory is asked about observations with the memory behind them.
     known = isinstance(expert, Expert) and expert.memory is not None

@@ -9,7 +9,7 @@ from fdtasil.errors import SettingError, first_line
 from fdtasil.rollouts.environments import EnvironmentPool
 from fdtasil.rollouts.episodes import Episodes
 
-__all__ = ["Constraints", "check_constraints", "violated"]
+__all__ = ["Constraints", "check_constraints", "try_constraints", "violated"]
 
 Constraint = Callable[[np.ndarray, np.ndarray], np.ndarray]
 """(N, n) observations and the (N, m) actions taken there -> (N,) numbers, positive where it is
@@ -54,19 +54,44 @@ def violated(
     states = episodes.observations[episodes.valid][:, :own]
     actions, _ = pool.bounds.put_inside(episodes.actions[episodes.valid])
     return {
-        name: float((_values(name, constraint, states, actions) > 0).mean())
+        name: float((_values(name, constraint, states, actions, pool) > 0).mean())
         for name, constraint in constraints.items()
     }
 
 
+def try_constraints(
+    constraints: Constraints, states: np.ndarray, actions: np.ndarray, pool: EnvironmentPool
+) -> None:
+    """Call each constraint on a few rows, before anything is recorded for them.
+
+    Args:
+        constraints: From `check_constraints`.
+        states: (N, n) observations; a memory behind the environment's own is left out.
+        actions: (N, m) as the environment takes them.
+        pool: The environment.
+
+    Raises:
+        SettingError: If one raises, or returns something else than a number for each step.
+    """
+    own = states[:, : pool.spaces.observations.size]
+    for name, constraint in constraints.items():
+        _values(name, constraint, own, actions, pool)
+
+
 def _values(
-    name: str, constraint: Constraint, states: np.ndarray, actions: np.ndarray
+    name: str,
+    constraint: Constraint,
+    states: np.ndarray,
+    actions: np.ndarray,
+    pool: EnvironmentPool,
 ) -> np.ndarray:
     try:
         found = np.asarray(constraint(states.copy(), actions.copy()), np.float64)
     except Exception as error:
         said = f"constraints: {name!r} raised {type(error).__name__}: {first_line(error)}"
-        raise SettingError(said, _CONSTRAINTS, _LIMIT) from error
+        order = pool.spaces.observations.order
+        flat = f"; an observation is {order}" if order else ""
+        raise SettingError(said, f"{_CONSTRAINTS}{flat}", _LIMIT) from error
     if found.shape != (len(states),) or np.isnan(found).any():
         nan = "NaN in " if np.isnan(found).any() else ""
         said = f"constraints: {name!r} returned {nan}shape {found.shape}"

@@ -73,7 +73,8 @@ class Distilled:
         evaluation: Student against expert, from the same starts; None where there was no expert
             or no environment to compare them in.
         history: Training losses, one entry for each 100 steps: round, step, loss, action_error,
-            derivative_error, curvature_error, moved_error, validation_loss.
+            derivative_error, curvature_error, moved_error, and where states are held out
+            validation_loss.
         queries: Rows that the expert answered, by purpose: act, label, probe, calibrate, check
             (the gate), evaluate, remember (a memory, carried over given states).
         settings: The exact arguments and what they resolved to, with versions; plain JSON.
@@ -161,7 +162,7 @@ class Distilled:
 
     def to_onnx(self, path: str | Path) -> Path:
         """Write the student as one ONNX file, whatever its name; see `export`."""
-        write_bytes(Path(path), self.export_bytes(MODEL))
+        write_bytes(check_path("path", path), self.export_bytes(MODEL))
         return Path(path)
 
     def to_sb3(self, env: Any, algorithm: str = "SAC", seed: int = 0) -> Any:
@@ -411,7 +412,8 @@ def _read_queries(queries: Any) -> dict[str, int]:
 
 def _csv(history: list[dict[str, float]]) -> bytes:
     target = io.StringIO()
-    writer = csv.DictWriter(target, list(history[0]), lineterminator="\n")
+    columns = dict.fromkeys(name for entry in history for name in entry)
+    writer = csv.DictWriter(target, columns, lineterminator="\n")
     writer.writeheader()
     writer.writerows(history)
     return target.getvalue().encode()
@@ -420,6 +422,10 @@ def _csv(history: list[dict[str, float]]) -> bytes:
 def _read_csv(data: bytes) -> list[dict[str, float]]:
     integers = {"round", "step"}
     return [
-        {name: int(value) if name in integers else float(value) for name, value in row.items()}
+        {
+            name: int(value) if name in integers else float(value)
+            for name, value in row.items()
+            if value
+        }
         for row in csv.DictReader(io.StringIO(data.decode()))
     ]

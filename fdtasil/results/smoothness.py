@@ -39,9 +39,11 @@ def smoothness_of(episodes: Episodes, pool: EnvironmentPool, expert: Episodes) -
         expert: Whose actions the units are of, where they have no bounds.
     """
     chosen, m = pool.spaces.actions, pool.boxes.action_size
-    flat, _ = pool.bounds.put_inside(episodes.actions.reshape(-1, m))
-    acted = flat.reshape(episodes.actions.shape).astype(np.float64)
-    both = episodes.valid[:, 1:] & episodes.valid[:, :-1]
+    until = int(episodes.lengths.max(initial=0))  # a horizon may be far beyond what was played
+    actions, valid = episodes.actions[:, :until], episodes.valid[:, :until]
+    flat, _ = pool.bounds.put_inside(actions.reshape(-1, m))
+    acted = flat.reshape(actions.shape).astype(np.float64)
+    both = valid[:, 1:] & valid[:, :-1]
     if not both.any():
         return Smoothness(None, None)
     scores = [column for start, end in chosen.choices for column in range(start, end)]
@@ -51,7 +53,7 @@ def smoothness_of(episodes: Episodes, pool: EnvironmentPool, expert: Episodes) -
     scaled = (acted / units)[:, :, numbers]
     changes = np.abs(np.diff(scaled, axis=1))[both]
     if chosen.choices:
-        best = chosen.best(acted.reshape(-1, m)).reshape(*episodes.valid.shape, -1)
+        best = chosen.best(acted.reshape(-1, m)).reshape(*valid.shape, -1)
         other = (best[:, 1:] != best[:, :-1])[both]
         changes = np.concatenate([changes, other], axis=1)
     fast = _high_frequency(scaled, episodes.lengths) if len(numbers) else None

@@ -240,8 +240,12 @@ def distances(expert: Episodes, other: Episodes, scales: Scales) -> np.ndarray:
 def _apart(expert: Episodes, other: Episodes, scales: Scales) -> np.ndarray:
     """Return (E, T) the distance of two paths, in deviations; NaN where one has ended."""
     both, live = expert.valid & other.valid, scales.live
-    apart = (other.observations - expert.observations)[..., live] / scales.deviation[live]
-    return np.where(both, np.sqrt((apart.astype(np.float64) ** 2).mean(axis=-1)), np.nan)
+    until = int(both.sum(axis=1).max(initial=0))  # a horizon may be far beyond what was played
+    theirs, ours = (one.observations[:, :until][..., live] for one in (expert, other))
+    apart = ((ours - theirs) / scales.deviation[live]).astype(np.float64)
+    found = np.full(both.shape, np.nan)
+    found[:, :until] = np.sqrt((apart**2).mean(axis=-1))
+    return np.where(both, found, np.nan)
 
 
 def _farthest(apart: np.ndarray) -> np.ndarray:

@@ -1,6 +1,7 @@
 """What a run comes to, as rows of a table: the model card and the page are made of them."""
 
 import ast
+import re
 from collections.abc import Mapping
 from dataclasses import fields
 from typing import Any
@@ -18,6 +19,7 @@ from fdtasil.student.fit import Fit
 __all__ = ["call_of", "run_rows"]
 
 _FIT = {field.name for field in fields(Fit)}
+_SHARES = re.compile(r"beta=(\[[^]]*\])")
 
 Rows = list[tuple[str, str]]
 
@@ -82,6 +84,8 @@ def call_of(settings: Mapping[str, Any], history: int) -> str:
     if history > 1 or data:  # left out, it is what the dataset shows
         given.append(f"history={history}")
     given.append(f"evaluation_episodes={settings['evaluation_episodes']}")
+    if settings.get("force"):
+        given.append("force=True")
     student = dict(settings["student"])
     if "architecture" not in student:
         hidden = tuple(student.get("hidden", ()))
@@ -99,9 +103,12 @@ def call_of(settings: Mapping[str, Any], history: int) -> str:
 
 
 def _made_anew(settings: Mapping[str, Any]) -> str | None:
-    """Return the code of an environment with options; None of another, or whose words are none."""
+    """Return the code of an environment of a module, or with options.
+
+    None of another, or whose words are none.
+    """
     name = _environment(settings)
-    if settings.get("made") is None or not _is_id(name):
+    if settings.get("made") is None or name is None:
         return None
     try:
         call = ast.parse(f"dict({settings['made']})", mode="eval").body
@@ -109,8 +116,12 @@ def _made_anew(settings: Mapping[str, Any]) -> str | None:
         told = {str(one.arg): ast.literal_eval(one.value) for one in words}
     except (SyntaxError, ValueError):
         return None
-    if not told or not told.keys() <= {"kwargs", "reset_options"}:
+    if not told or not told.keys() <= {"module", "kwargs", "reset_options"}:
         return None
+    if module := told.pop("module", None):
+        name = f"{module}:{name}"
+    if not told:
+        return repr(name)
     options = ", ".join(f"{name}={value!r}" for name, value in told.items())
     return f"fdtasil.Environment({name!r}, {options})"
 
@@ -121,7 +132,8 @@ def _trainer(described: str) -> str:
     if not odd or name not in TRAINERS:
         return repr(described)
     made_by = getattr(TRAINERS[name], "__name__", name)
-    return f"fdtasil.{made_by}({settings})"
+    shares = r"beta=lambda round_: \1[round_ - 1]"  # of a function, what it said of each round
+    return f"fdtasil.{made_by}({_SHARES.sub(shares, settings)})"
 
 
 def _spread(written: Mapping[str, Any]) -> dict[int, float] | str:

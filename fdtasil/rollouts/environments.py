@@ -401,14 +401,16 @@ def _action_bounds(
     environment: gymnasium.Env | Together, layout: Layout
 ) -> tuple[np.ndarray, np.ndarray]:
     """Return the bounds of actions; those that ClipAction hides are the ones it clips to."""
-    layer = environment
+    layer, inside = environment, layout
     while isinstance(layer, gymnasium.Wrapper):
         clips = isinstance(layer, gymnasium.wrappers.ClipAction)
-        if not clips and layer.action_space != layer.env.action_space:
+        if isinstance(layer, Flat):
+            inside = layer.spaces.actions
+        elif not clips and layer.action_space != layer.env.action_space:
             break
         layer = layer.env
         if clips:
-            return bounds_of(layer.action_space, layout)
+            return bounds_of(layer.action_space, inside)
     return bounds_of(environment.action_space, layout)
 
 

@@ -124,7 +124,8 @@ class SideBySide:
         with record.blames(alive[0], step, "step()"):
             found = self._together.step(rows if layout.plain else layout.values(rows))
         over = found.terminated | found.truncated
-        record.note(alive, step, found.rewards[slots], found.terminated[slots])
+        now = (part[slots] for part in (found.rewards, found.terminated, found.reset))
+        record.note(alive, step, *now)
         record.check_rewards(alive, step)
         return self._observed(found.observations, alive, step), ~over[slots]
 

@@ -15,6 +15,7 @@ from fdtasil.rollouts.behaviours import Decision, silent_rows
 from fdtasil.rollouts.environments import EnvironmentPool
 from fdtasil.rollouts.episodes import Episodes
 from fdtasil.rollouts.narrowing import Narrowing
+from fdtasil.rollouts.physics import clock, data_of, was_reset
 from fdtasil.rollouts.spaces import Mismatch
 
 __all__ = ["HOLD", "Recording"]
@@ -51,7 +52,6 @@ class Recording:
         self.physics_resets = np.zeros(episodes, np.int64)
         self.clipped_actions = 0
         self._narrowing = Narrowing(n, pool.name)
-        # Of MuJoCo's simulations, None elsewhere; asking an environment for it takes a while.
         self._data: list[object] = [None] * episodes
 
     def reset(self, environment: gymnasium.Env, episode: int) -> np.ndarray:
@@ -72,7 +72,7 @@ class Recording:
                 "package: wrap it so)",
             )
         observation = _own(answer[0])
-        self._data[episode] = getattr(environment.unwrapped, "data", None)
+        self._data[episode] = data_of(environment)
         return observation
 
     def step(
@@ -80,7 +80,7 @@ class Recording:
     ) -> tuple[np.ndarray, bool]:
         """Record a step's outcome; return the observation and whether the episode goes on."""
         data = self._data[episode]
-        before = _clock(data)
+        before = clock(data)
         try:
             answer = environment.step(action)
         except Mismatch as mismatch:
@@ -101,11 +101,7 @@ class Recording:
                 f"step() returned {_described(answer)}",
                 "(observation, reward, terminated, truncated, info), the reward one number",
             ) from error
-        # MuJoCo resets an unstable simulation inside step() and says so only by its clock, and
-        # where the clock had not come far by its warnings.
-        now = _clock(data)
-        if now < before or ((now == before or step == 0) and _unstable(data)):
-            self.physics_resets[episode] += 1
+        self.physics_resets[episode] += was_reset(data, before, first=step == 0)
         return _own(observation), going
 
     def seed(self, episode: int) -> int:
@@ -123,11 +119,17 @@ class Recording:
             raise self._crash(episode, step, call, error) from error
 
     def note(
-        self, alive: Sequence[int], step: int, rewards: np.ndarray, terminated: np.ndarray
+        self,
+        alive: Sequence[int],
+        step: int,
+        rewards: np.ndarray,
+        terminated: np.ndarray,
+        reset: np.ndarray,
     ) -> None:
-        """Record a step's (B,) rewards and ends of episodes that step together."""
+        """Record a step's (B,) rewards, ends and resets of episodes that step together."""
         self.rewards[alive, step] = rewards
         self.terminated[alive] = terminated
+        self.physics_resets[alive] += reset
 
     def check_rewards(self, alive: Sequence[int], step: int) -> None:
         """Raise where a reward is not finite: it would make every mean so."""
@@ -277,23 +279,6 @@ class Recording:
             "an environment that runs without raising",
             advice or "run it on its own from that seed, and mend it",
         )
-
-
-def _clock(data: object) -> float:
-    """Return the time of a MuJoCo simulation; 0 where there is none."""
-    time = getattr(data, "time", 0.0)
-    return time if isinstance(time, float) else 0.0
-
-
-def _unstable(data: object) -> bool:
-    """Return whether MuJoCo has found a simulation unstable since the episode began."""
-    numbers = getattr(getattr(data, "warning", None), "number", None)
-    if numbers is None:
-        return False
-    import mujoco  # whoever has such data has loaded it
-
-    kinds = (f"mjWARN_BAD{what}" for what in ("QPOS", "QVEL", "QACC"))
-    return any(numbers[int(vars(mujoco)["mjtWarning"].__members__[kind])] for kind in kinds)
 
 
 def _described(answer: object) -> str:

@@ -166,6 +166,14 @@ class Layout:
         return tuple(found)
 
     @property
+    def order(self) -> str:
+        """What stands where in the flat form, "0:2 cart, 2:5 pole"; "" of a single part."""
+        if not self.names:
+            return ""
+        pairs = zip(self.parts, self.starts, strict=True)
+        return ", ".join(f"{start}:{start + part.size} {part.name}" for part, start in pairs)
+
+    @property
     def held(self) -> tuple[int, ...]:
         """The numbers that no probe moves, for there is nothing between two of their values."""
         kinds = np.repeat([p.kind == "number" for p in self.parts], [p.size for p in self.parts])
@@ -212,6 +220,10 @@ class Layout:
         flat = rows and (first.path or first.shape != given.shape)
         if flat and given.shape[-1] == self.size and given.dtype.kind == "f":
             return np.atleast_2d(given).astype(np.float32), given.ndim == 1
+        if rows and first.path:
+            raise Mismatch(
+                f"shape {given.shape} of {given.dtype}, where flat ones are ({self.size},) floats"
+            )
         one = np.ndim(to_numpy(_picked(given, first))) == len(first.shape)
         found = self.row(given)[None] if one else self.rows(given)
         return found.astype(np.float32), one

@@ -4,6 +4,7 @@ from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 
+from fdtasil.errors import SettingError
 from fdtasil.rollouts.behaviours import Behaviour, Decision
 from fdtasil.rollouts.playing import Playing
 from fdtasil.rollouts.recording import Recording
@@ -58,6 +59,12 @@ def step_by_step(
     alive = playing.episodes
     for step in range(horizon):
         decision = behaviour(batch, [noise[e] for e in alive])
+        if not isinstance(decision, Decision):
+            raise SettingError(
+                f"a trainer's behaviour that returns a {type(decision).__name__}",
+                "a Decision: the actions, and the expert's answers or None",
+                "from fdtasil.rollouts.behaviours import Decision; return Decision(actions, None)",
+            )
         if decision.silent is not None:
             decision, heard = record.hold(alive, step, decision)
             if not heard.all():

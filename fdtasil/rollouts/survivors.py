@@ -1,6 +1,6 @@
 """Other episodes in the place of those that the environment ended."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
@@ -18,13 +18,13 @@ ATTEMPTS = 3
 
 
 def survivors(
-    episodes: Episodes, record: Callable[[int, int], Episodes], name: str
+    episodes: Episodes, record: Callable[[int, Sequence[int]], Episodes], name: str
 ) -> tuple[Episodes, int]:
     """Record other episodes in the place of those that the environment ended.
 
     Args:
         episodes: What was recorded.
-        record: Number of the first episode, and how many -> further ones.
+        record: Number of the first further episode, and in the place of which -> those episodes.
         name: Of the environment.
 
     Returns:
@@ -34,7 +34,7 @@ def survivors(
     for _ in range(ATTEMPTS):
         fallen = np.flatnonzero(episodes.terminated | episodes.given_up)
         if len(fallen):
-            episodes = _replaced(episodes, fallen, record(recorded, len(fallen)))
+            episodes = _replaced(episodes, fallen, record(recorded, fallen.tolist()))
             recorded += len(fallen)
     left = int(episodes.terminated.sum())
     if left:

@@ -10,9 +10,12 @@ import gymnasium
 import numpy as np
 
 from fdtasil.errors import EnvironmentFault, warn
+from fdtasil.rollouts.physics import RESET, TellsResets, clock, data_of, was_reset
 from fdtasil.rollouts.spaces import to_numpy
 
 __all__ = ["Together", "TogetherStep", "make_vector", "vector_of"]
+
+_PATIENCE = 5.0  # seconds that processes of environments have to end
 
 
 class TogetherStep(NamedTuple):
@@ -23,12 +26,15 @@ class TogetherStep(NamedTuple):
         rewards: (N,).
         terminated: (N,) bool.
         truncated: (N,) bool.
+        reset: (N,) bool, whose simulation MuJoCo reset inside the step, as far as it is known; of
+            an episode that is over, it is not.
     """
 
     observations: Any
     rewards: np.ndarray
     terminated: np.ndarray
     truncated: np.ndarray
+    reset: np.ndarray
 
 
 class Together(Protocol):
@@ -93,10 +99,12 @@ class _Gymnasium:
         self._over = np.zeros(self.count, bool)
         self._options: dict[str, Any] = {}
         self._each, self._like = True, None
+        self._simulations = _Simulations(getattr(env.unwrapped, "envs", ()))
 
     def reset(self, seeds: Sequence[int], options: Any) -> Any:
         self._over[:], self._options = False, dict(options or {})
         observations = self._reset(list(seeds), options)
+        self._simulations.begin()
         leaf = observations
         while isinstance(leaf, dict | tuple):
             leaf = next(iter(leaf.values() if isinstance(leaf, dict) else leaf))
@@ -110,13 +118,28 @@ class _Gymnasium:
             import torch
 
             actions = torch.as_tensor(actions).to(self._like.device)
-        observations, rewards, terminated, truncated, _ = self._env.step(actions)
-        parts = TogetherStep(observations, *map(to_numpy, (rewards, terminated, truncated)))
-        self._over = np.logical_or(parts.terminated, parts.truncated)
-        return parts
+        try:
+            observations, rewards, terminated, truncated, info = self._env.step(actions)
+        except (EOFError, ConnectionError) as error:  # which say nothing
+            raise ChildProcessError("one of its processes has ended") from error
+        rewards, terminated, truncated = map(to_numpy, (rewards, terminated, truncated))
+        self._over = np.logical_or(terminated, truncated)
+        told = np.asarray(info[RESET], bool) if RESET in info else False
+        reset = (self._simulations.reset(self.count) | told) & ~self._over
+        return TogetherStep(observations, rewards, terminated, truncated, reset)
 
     def close(self) -> None:
-        self._env.close()
+        inner = self._env.unwrapped
+        workers = getattr(inner, "processes", None)
+        if workers is None:
+            self._env.close()
+            return
+        try:
+            self._env.close(timeout=_PATIENCE)  # a step that is under way is waited for
+        except (EOFError, OSError):  # of a worker that is gone
+            inner.closed = True
+        finally:
+            _end(workers)
 
     def _reset(self, seeds: list[int], options: Any) -> Any:
         if self._each:
@@ -145,24 +168,73 @@ class _Sb3:
         self._innermost = env
         while hasattr(self._innermost, "venv"):
             self._innermost = self._innermost.venv
+        self._simulations = _Simulations(getattr(self._innermost, "envs", ()))
 
     def reset(self, seeds: Sequence[int], options: Any) -> Any:
         # Its own seed() takes one for all; each environment's is what it hands on.
         self._innermost._seeds = list(seeds)
         if options is not None:
             self._innermost.set_options(options)
-        return self._env.reset()
+        observations = self._env.reset()
+        self._simulations.begin()
+        return observations
 
     def step(self, actions: Any) -> TogetherStep:
-        observations, rewards, done, infos = self._env.step(actions)
+        try:
+            observations, rewards, done, infos = self._env.step(actions)
+        except (EOFError, ConnectionError) as error:  # which say nothing
+            raise ChildProcessError("one of its processes has ended") from error
         late = np.array([bool(info.get("TimeLimit.truncated", False)) for info in infos])
         over = np.asarray(done, bool)
+        reset = self._simulations.reset(self.count) & ~over
         return TogetherStep(
-            observations, np.asarray(rewards, np.float64), over & ~late, over & late
+            observations, np.asarray(rewards, np.float64), over & ~late, over & late, reset
         )
 
     def close(self) -> None:
-        self._env.close()
+        workers = getattr(self._innermost, "processes", ())
+        try:
+            if getattr(self._innermost, "waiting", False):  # its close() waits for ever
+                self._innermost.closed = True
+            else:
+                self._env.close()
+        except (EOFError, OSError):  # of a worker that is gone
+            self._innermost.closed = True
+        finally:
+            _end(workers)
+
+
+class _Simulations:
+    """MuJoCo's simulations of environments that step together in this process.
+
+    Args:
+        environments: One for each episode; empty where they are elsewhere.
+    """
+
+    def __init__(self, environments: Sequence[Any]) -> None:
+        self._environments = environments
+        self._data: list[object] = []
+
+    def begin(self) -> None:
+        """See that episodes begin."""
+        self._data = [data_of(one) for one in self._environments]
+        self._clocks, self._first = [clock(one) for one in self._data], True
+
+    def reset(self, count: int) -> np.ndarray:
+        """Return (N,) bool, which of `count` were reset in the last step."""
+        pairs = zip(self._data, self._clocks, strict=True)
+        found = [was_reset(data, before, first=self._first) for data, before in pairs]
+        self._clocks, self._first = [clock(one) for one in self._data], False
+        return np.array(found, bool) if found else np.zeros(count, bool)
+
+
+def _end(workers: Sequence[Any]) -> None:
+    """End the processes of environments that are left, whatever they do."""
+    for one in workers:
+        if one.is_alive():
+            one.terminate()
+    for one in workers:
+        one.join(_PATIENCE)
 
 
 _NORMALISERS = ("NormalizeObservation", "NormalizeReward", "VecNormalize")
@@ -205,4 +277,5 @@ def make_vector(name: str, count: int, kwargs: dict[str, Any]) -> gymnasium.vect
     module, colon, _ = name.partition(":")
     if colon:
         importlib.import_module(module)
-    return gymnasium.make_vec(name, count, vectorization_mode="async", **kwargs)
+    told = [TellsResets]
+    return gymnasium.make_vec(name, count, vectorization_mode="async", wrappers=told, **kwargs)

@@ -67,6 +67,8 @@ class Environment:
         if not isinstance(self.environment, str):
             called = getattr(self.environment, "__name__", None)
             told.append(f"made by {called}" if called else "made by the caller")
+        elif ":" in self.environment:  # gymnasium forgets it
+            told.append(f"module={self.environment.partition(':')[0]!r}")
         for name in ("kwargs", "reset_options"):
             if getattr(self, name):
                 told.append(f"{name}={dict(getattr(self, name))!r}")

@@ -1,6 +1,7 @@
 """Recording and labelling the episodes of a round, whoever its trainer lets act."""
 
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -73,9 +74,9 @@ class Collecting:
         replaced = 0
         if round_ == 0 and self.keep == SURVIVORS:
 
-            def further(first: int, count: int) -> Episodes:
-                # One that begins anew: what it does in its first episode is done again.
-                return self._episodes(self._behaviour(0, None), "survivors", first, count)
+            def further(first: int, places: Sequence[int]) -> Episodes:
+                behaviour = self._behaviour(0, None, places)
+                return self._episodes(behaviour, "survivors", first, len(places))
 
             episodes, replaced = survivors(episodes, further, self.pool.name)
         states = label(episodes, self.expert, first, round_)
@@ -123,7 +124,9 @@ class Collecting:
             "resume with that expert, or start anew in another folder",
         )
 
-    def _behaviour(self, round_: int, student: Policy | None) -> Behaviour:
+    def _behaviour(
+        self, round_: int, student: Policy | None, places: Sequence[int] | None = None
+    ) -> Behaviour:
         """Return who acts in a round, which may take a few more episodes to find out."""
 
         def record_extra(behaviour: Behaviour, extra: int) -> Episodes:
@@ -132,7 +135,7 @@ class Collecting:
         boxes = self.pool.boxes
         half = np.where(boxes.bounded, (boxes.high - boxes.low) / 2, np.float32(1))
         chooses = bool(self.pool.spaces.actions.choices)
-        situation = Situation(round_, self.expert, half, student, record_extra, chooses)
+        situation = Situation(round_, self.expert, half, student, record_extra, chooses, places)
         return self.trainer.behaviour(situation)
 
     def _episodes(self, behaviour: Behaviour, stream: str, first: int, count: int) -> Episodes:

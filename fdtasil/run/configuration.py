@@ -5,7 +5,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any
 
-from fdtasil.demonstrations.trainers import Trainer, describe_trainer
+from fdtasil.demonstrations.trainers import Trainer, describe_trainer, rounds_of
 from fdtasil.errors import SettingError
 from fdtasil.experts.expert import rows_text
 from fdtasil.experts.gate import GATE_QUERIES, GATE_STATES, large_batch
@@ -61,6 +61,7 @@ class Configuration:
         spaces: Of the environment, where they are no plain boxes.
         made: How the environment is made and reset, in words, where its id does not say it.
         opened: With which options the expert was opened, in words; None for none.
+        force: Whether it goes on where the expert fails the gate but answers.
     """
 
     expert: str | None
@@ -94,6 +95,7 @@ class Configuration:
     spaces: Spaces | None = None
     made: str | None = None
     opened: str | None = None
+    force: bool = False
 
     @property
     def held(self) -> tuple[int, ...]:
@@ -199,7 +201,7 @@ class Configuration:
     @property
     def rounds(self) -> list[int]:
         """Number of episodes of each round; one round of all where they are given."""
-        return self.trainer.rounds(self.episodes) if self.trainer else [self.episodes]
+        return rounds_of(self.trainer, self.episodes) if self.trainer else [self.episodes]
 
     @property
     def ladder(self) -> Ladder:
@@ -278,8 +280,10 @@ class Configuration:
 
     def to_json(self) -> dict[str, Any]:
         """Return the configuration as plain JSON values, every field of it."""
+        trainer = self.trainer
+        described = describe_trainer(trainer, len(self.rounds)) if trainer else "none"
         written = {
-            "trainer": describe_trainer(self.trainer) if self.trainer else "none",
+            "trainer": described,
             "probes": self.probes.describe() if self.probes else "none",
             "student": describe(self.student),
             "spread": self.spread.to_json(),

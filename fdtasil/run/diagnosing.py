@@ -89,8 +89,8 @@ def diagnose(
         progress: Show progress bars, in a terminal or a notebook.
 
     Raises:
-        SettingError: If actions are choices, which nothing is between, or all that is observed
-            is choices, flags or whole numbers.
+        SettingError: If actions are choices, which nothing is between, all that is observed is
+            choices, flags or whole numbers, or one of the two has a memory.
         ExpertError: If one of the two can't be opened, or the expert fails the gate.
         EnvironmentFault: If the environment can't be used, or misbehaves.
 

@@ -11,12 +11,12 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from tempfile import TemporaryFile
 from typing import IO, Any, TypeVar
 
-from fdtasil.errors import FdtasilError, FitError
+from fdtasil.errors import FdtasilError, FitError, SettingError, first_line
 from fdtasil.experts.worker_process import connect, receive, send
 
 __all__ = ["Call", "elsewhere", "side_by_side"]
@@ -85,6 +85,9 @@ def elsewhere(title: str, function: Callable[..., Any], *arguments: Any) -> Iter
         title: What errors call it.
         function: Of a module, so that the other process can import it.
         arguments: Its arguments; they are pickled.
+
+    Raises:
+        SettingError: If they can't be.
     """
     command = [sys.executable, "-P", "-c", _BEGIN, *sys.path]
     with (
@@ -94,7 +97,18 @@ def elsewhere(title: str, function: Callable[..., Any], *arguments: Any) -> Iter
     ):
         try:
             assert process.stdin is not None
-            send(process.stdin, (function, arguments))
+            try:
+                send(process.stdin, (function, arguments))
+            except OSError:  # it has ended already; `outcome` says how
+                with suppress(OSError):
+                    process.stdin.close()
+            except (pickle.PicklingError, AttributeError, TypeError) as error:
+                raise SettingError(
+                    f"{title} in another process, which can't be sent what it is made from: "
+                    f"{first_line(error)}",
+                    "paths, ids and plain values",
+                    "do it in this process: leave workers= out, in a shell --baseline",
+                ) from error
             yield Call(title, process, reply, said)
         finally:
             process.kill()

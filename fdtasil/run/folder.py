@@ -33,11 +33,13 @@ from fdtasil.files.storage import (
 )
 from fdtasil.rollouts.trials import other_environment
 
-__all__ = ["CHECKPOINT_SECONDS", "RunFolder", "open_run_folder"]
+__all__ = ["CHECKPOINT_SECONDS", "KEPT", "RunFolder", "open_run_folder"]
 
 CHECKPOINT_SECONDS = 20.0
 """Time between two checkpoints inside a stage; when they are taken changes no byte."""
 
+KEPT = "what is done is kept"
+"""How the note begins that says how to go on."""
 _CONFIG_LIMIT = 2**24
 _FINGERPRINT = "fingerprint"
 
@@ -81,13 +83,13 @@ def open_run_folder(
             raise SettingError(
                 f"{path} holds a run that has not ended",
                 "an empty folder, or a finished run (which is replaced)",
-                f"{going_on}, or choose another folder",
+                f"{going_on}; choose another folder, or remove this one",
             )
         try:
             yield folder
         except BaseException as error:
             if folder.begun:
-                error.add_note(f"what is done is kept: {going_on}")
+                error.add_note(f"{KEPT}: {going_on}")
             raise
 
 

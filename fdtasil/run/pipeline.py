@@ -46,6 +46,7 @@ from fdtasil.run.report import config_of, no_answer, report_of
 from fdtasil.run.rounds import Rounds
 from fdtasil.run.subject import Subject, bounded, named, open_subject
 from fdtasil.run.training import Training
+from fdtasil.run.trying import try_functions
 from fdtasil.seeding import episode_seeds
 from fdtasil.student.architectures import Architecture
 from fdtasil.student.fit import Fit
@@ -221,7 +222,8 @@ def distill(
                 given = bounded(given, subject.pool)
             given = showing(given, history, subject.actions)
         arguments = replace(arguments, given=given, student_obs=student_obs)
-        run, bars = arguments.configure(subject, going_on), Progress(progress)
+        run = replace(arguments.configure(subject, going_on), force=force)
+        bars = Progress(progress)
         run.check_spread(given.spread if given is not None and run.probes_given else None)
         run.check_budget()
         usual = arguments.preset.fit
@@ -315,6 +317,8 @@ def _complete(
     """Gate, rounds, evaluation, report."""
     run, checkpoints = rounds.run, rounds.training.checkpoints
     with torch_settings(device) as precision:
+        if subject.pool is not None:
+            try_functions(subject.pool, rounds.student_obs, constraints, run.seed)
         theirs = _examined(rounds, subject, given, force=force)
         checkpoints.account.start_clock()
         lesson, trained = rounds.complete(given, theirs)

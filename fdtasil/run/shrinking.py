@@ -11,7 +11,7 @@ from typing import Any
 
 import torch
 
-from fdtasil.checks import check_count, check_flag, check_path, check_share
+from fdtasil.checks import check_count, check_flag, check_path, check_share, spelt
 from fdtasil.errors import SettingError, warn
 from fdtasil.experts.load import ExpertLike
 from fdtasil.files.lock import locked
@@ -23,13 +23,13 @@ from fdtasil.rollouts.environments import EnvironmentLike, EnvironmentPool
 from fdtasil.rollouts.wanted import Environment, import_module_of
 from fdtasil.run.elsewhere import side_by_side
 from fdtasil.run.evaluating import evaluate
-from fdtasil.run.folder import RunFolder
+from fdtasil.run.folder import KEPT, RunFolder
 from fdtasil.run.judging import warn_of_another_environment
 from fdtasil.run.pipeline import distill
 from fdtasil.student.architectures import Mlp
 from fdtasil.student.fit import Fit
 
-__all__ = ["LADDER", "OTHER_STARTS", "shrink"]
+__all__ = ["LADDER", "OTHER_STARTS", "fit_of", "shrink"]
 
 LADDER: tuple[tuple[int, ...], ...] = (
     (8, 8),
@@ -81,7 +81,7 @@ def shrink(
         evaluation_episodes: Paired episodes; the more, the narrower the interval.
         horizon: As in `distill`; left out, the run's.
         seed: Left out, the run's.
-        fit: As in `distill`.
+        fit: As in `distill`; left out, the run's.
         force: Go on with a warning where the expert fails the gate but answers.
         out: Folder of the runs, one for each student. What is done in it is taken up, so that it
             may be killed and begun again.
@@ -98,6 +98,12 @@ def shrink(
         print(found)
         found.result.export("student.c")
     """
+    if expert is None or env is None:
+        raise SettingError(
+            f"no {'expert' if expert is None else 'environment'} to judge students with",
+            "the expert of the run, and its environment",
+            "write for example shrink(run, expert, env)",
+        )
     share, workers = check_share("keep", keep), check_count("workers", workers)
     result = run if isinstance(run, Distilled) else Distilled.load(check_path("run", run))
     jobs = _jobs(sizes, activations)
@@ -123,13 +129,17 @@ def shrink(
         "evaluation_episodes": check_count("evaluation_episodes", evaluation_episodes, 2),
         "horizon": result.settings["horizon"] if horizon is None else horizon,
         "seed": result.settings["seed"] if seed is None else seed,
-        "fit": fit,
+        "fit": fit_of(result) if fit is None else fit,
         "force": check_flag("force", force),
         "progress": False,
     }
     found = dict[_Job, Distilled]()
     count, bars = len(jobs) * (1 + cloned), Progress(check_flag("progress", progress))
-    with _place_of(folder, workers) as place, bars.bar("students", "student", count) as bar:
+    with (
+        _going_on(folder),
+        _place_of(folder, workers) as place,
+        bars.bar("students", "student", count) as bar,
+    ):
         train = partial(_trained, expert, env, settings, place)
 
         def train_all(jobs: Sequence[_Job]) -> None:
@@ -147,6 +157,11 @@ def shrink(
     if shrunk.judged and shrunk.result is None:
         warn(f"no student of {len(jobs)} keeps {share:.0%} of the expert's return")
     return shrunk
+
+
+def fit_of(result: Distilled) -> Fit:
+    """Return how the student of a run was trained."""
+    return Fit.from_json(result.settings["fit"])
 
 
 def _seen(result: Distilled) -> tuple[int, ...] | None:
@@ -194,6 +209,13 @@ class _Job:
 
 def _jobs(sizes: Sequence[tuple[int, ...]], activations: Sequence[str]) -> list[_Job]:
     """Return the students with probes; what can't be built is refused before anything is."""
+    listed = isinstance(sizes, Sequence) and not isinstance(sizes, str)
+    if not listed or not all(isinstance(one, Sequence) for one in sizes):
+        raise SettingError(
+            spelt("sizes", sizes),
+            "the hidden layers of each student, (64, 64) for two of 64 units",
+            "write for example sizes=[(32,), (64, 64)]",
+        )
     jobs = []
     for hidden in sizes:
         for activation in activations:
@@ -203,6 +225,18 @@ def _jobs(sizes: Sequence[tuple[int, ...]], activations: Sequence[str]) -> list[
     if not jobs:
         raise SettingError("no sizes", "one student at least", "leave sizes= out")
     return jobs
+
+
+@contextmanager
+def _going_on(folder: Path | None) -> Iterator[None]:
+    """Say how to go on after an interruption: what a student's own run advises is of it alone."""
+    try:
+        yield
+    except BaseException as error:
+        notes = [one for one in getattr(error, "__notes__", []) if not one.startswith(KEPT)]
+        again = f"{KEPT} in {folder}: the same call again goes on with it"
+        error.__notes__ = notes if folder is None else [*notes, again]
+        raise
 
 
 @contextmanager
@@ -247,7 +281,7 @@ def _trained(
     given, probes = dict(settings), None
     if job.cloned is not None:
         given["dataset"] = replace(settings["dataset"], probes=None, answers=None)
-        given["fit"] = replace(settings["fit"] or Fit(), steps=job.cloned, epochs=None)
+        given["fit"] = replace(settings["fit"], steps=job.cloned, epochs=None)
         probes = 0
     train = partial(distill, expert, env, probes, student=Mlp(job.hidden, job.activation), **given)
     if folder is None:

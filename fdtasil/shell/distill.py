@@ -70,7 +70,10 @@ def _distill(baseline: bool, **arguments: Any) -> None:
             result = distil({**arguments, **place})  # it stays in its own folder
         print(_side_by_side(result, cloning()))
     chosen = result.report.get("probes_chosen")
-    print(f"queries: {rows_text(result.queries)}" + (f" ({shown(chosen)})" if chosen else ""))
+    print(
+        f"queries: {rows_text(result.queries) or 'none'}"
+        + (f" ({shown(chosen)})" if chosen else "")
+    )
     sizes = {name: size_text(size) for name, size in result.report["size"].items()}
     print("; ".join(f"{name}: {text}" for name, text in sizes.items()))
     print(f"saved in {out}: student.onnx, student.safetensors, report.json, figures/, ...")

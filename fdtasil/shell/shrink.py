@@ -1,12 +1,13 @@
 """`fdtasil shrink`: students of several sizes from one run's answers."""
 
+from dataclasses import replace
 from inspect import Parameter
 from pathlib import Path
 from typing import Any
 
+from fdtasil.results.distilled import Distilled
 from fdtasil.rollouts.wanted import import_module_of
-from fdtasil.run.presets import preset_of
-from fdtasil.run.shrinking import LADDER, shrink
+from fdtasil.run.shrinking import LADDER, fit_of, shrink
 from fdtasil.shell.call import EXPERT_FLAGS, MADE_FLAGS, opened, wanted
 from fdtasil.shell.command import (
     EnvironmentId,
@@ -40,12 +41,13 @@ def _shrink(
     import_module_of(env)
     place = wanted(env, env_kwargs, reset_options)
     asked = opened(expert, place, output=output, inputs=inputs, trust=trust)
+    result = Distilled.load(run)
     found = shrink(
-        run,
+        result,
         asked,
         place,
         sizes=[(width,) * layers for width in widths],
-        fit=None if steps is None else preset_of("standard").fit_with(steps=steps),
+        fit=None if steps is None else replace(fit_of(result), steps=steps, epochs=None),
         out=place_of_runs.absolute(),
         **arguments,
     )

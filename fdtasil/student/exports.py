@@ -89,8 +89,7 @@ def order_of(student: Student, metadata: Mapping[str, str]) -> str:
             f"{columns.count(',') + 1} of them, by {COLUMNS}" if len(columns) > _LONG else columns
         )
         return f"of the environment's numbers {told}" if columns else ""
-    pairs = zip(layout.parts, layout.starts, strict=True)
-    return ", ".join(f"{start}:{start + part.size} {part.name}" for part, start in pairs)
+    return layout.order
 
 
 def _comment(student: Student, metadata: Mapping[str, str]) -> dict[str, str]:

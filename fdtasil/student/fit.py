@@ -1,7 +1,7 @@
 """Minibatch optimisation of a student; knows no environment and no expert."""
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, field
 from functools import partial
 from itertools import count, islice
@@ -112,6 +112,15 @@ class Fit:
         rule = {"steps": steps, "steps_for": whole.enough, "learning_rate": whole.learning_rate}
         return {**asdict(self), **rule}
 
+    @classmethod
+    def from_json(cls, written: Mapping[str, Any]) -> "Fit":
+        """Read what `to_json` returned; a usual length and its rate are left out again."""
+        known = {name: written[name] for name in cls.__dataclass_fields__ if name in written}
+        if written.get("steps_for") is not None:
+            usual = known["learning_rate"] in (USUAL.learning_rate, ANEW.learning_rate)
+            known |= {"steps": None} | ({"learning_rate": None} if usual else {})
+        return cls(**known)
+
     def schedule(self, *, anew: bool = False) -> Schedule:
         """Return the schedule, with what is left out filled in.
 
@@ -188,8 +197,8 @@ def fit(
 
     Returns:
         One entry for each 100 steps: step, loss, action_error, derivative_error,
-        curvature_error, moved_error (means since the last entry), and validation_loss (the loss
-        itself where nothing is held out).
+        curvature_error, moved_error (means since the last entry), and validation_loss where
+        states are held out.
 
     Raises:
         FitError: If a loss or a weight is not finite; the student is of no use then.

@@ -89,8 +89,8 @@ class FitState:
             "step": self.step,
             **dict(zip(TaylorLoss._fields, means, strict=True)),
         }
-        entry["validation_loss"] = entry["loss"] if held_out is None else held_out
         if held_out is not None:
+            entry["validation_loss"] = held_out
             self.stale += 1
             if held_out < self._best_loss:
                 self.stale, self._best_loss = 0, held_out

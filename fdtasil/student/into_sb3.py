@@ -92,12 +92,29 @@ def agent_of(student: Student, env: Any, algorithm: str, seed: int, states: np.n
             "the environment that the student was trained in, with actions that the library takes",
             "pass its id, or the environment itself, in a wrapper that flattens its actions",
         ) from error
-    _check_normaliser(agent)
-    _check_spaces(student, agent, choices)
+    try:
+        _check_normaliser(agent)
+        _check_spaces(student, agent, choices)
+        _take_over(student, agent, layers, layers_of(agent.policy))
+    except ExportError:
+        if isinstance(env, str):  # the library made it
+            agent.env.close()
+        raise
+    if algorithm == "TD3":
+        agent.policy.actor_target.load_state_dict(agent.policy.actor.state_dict())
+    return agent
+
+
+def _take_over(student: Student, agent: Any, layers: Layers, actor: Sequence[nn.Linear]) -> None:
+    """Give the layers of an agent's actor the weights of a student.
+
+    Raises:
+        ExportError: If they are of other sizes.
+    """
     if type(agent.action_space).__name__ == "MultiBinary":  # a logit of yes, for no and yes
         weight, bias = layers[-1]
         layers[-1] = weight[1::2] - weight[::2], bias[1::2] - bias[::2]
-    pairs = list(zip(layers_of(agent.policy), layers, strict=True))
+    pairs = list(zip(actor, layers, strict=True))
     if any(mine.weight.shape != weight.shape for mine, (weight, _) in pairs):
         raise ExportError(
             f"a student of {student.observation_size} observations and {student.action_size} "
@@ -109,9 +126,6 @@ def agent_of(student: Student, env: Any, algorithm: str, seed: int, states: np.n
         for mine, (weight, bias) in pairs:
             mine.weight.copy_(weight)
             mine.bias.copy_(bias)
-        if algorithm == "TD3":
-            agent.policy.actor_target.load_state_dict(agent.policy.actor.state_dict())
-    return agent
 
 
 def _check_normaliser(agent: Any) -> None:
@@ -133,7 +147,7 @@ def _check_spaces(student: Student, agent: Any, choices: bool) -> None:
         return
     low, high = (np.asarray(end, np.float32).ravel() for end in (space.low, space.high))
     ours = student.low.numpy(), student.high.numpy()
-    if low.shape == ours[0].shape and np.allclose((low, high), ours, rtol=1e-5):
+    if low.shape == ours[0].shape and np.allclose((low, high), ours, rtol=1e-5, atol=0):
         return
     raise ExportError(
         f"a student of actions from {ours[0]} to {ours[1]}",

@@ -5,7 +5,6 @@ import pickle
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import wraps
 
 import numpy as np
 
@@ -234,8 +233,23 @@ def visible(
     if student_obs is None:
         return tuple(range(own))
     if callable(student_obs) and not isinstance(student_obs, type):
-        return wraps(student_obs)(lambda rows: student_obs(rows[:, :own]))
+        return _Own(student_obs, own)
     return describe_view(student_obs, own)  # pyright: ignore[reportReturnType]
+
+
+@dataclass(frozen=True)
+class _Own:
+    """A user's function, of the environment's own part of an observation."""
+
+    function: Callable[[np.ndarray], np.ndarray]
+    size: int
+
+    @property
+    def __name__(self) -> str:
+        return getattr(self.function, "__name__", type(self.function).__name__)
+
+    def __call__(self, rows: np.ndarray) -> np.ndarray:
+        return self.function(rows[:, : self.size])
 
 
 def _called(function: Callable[..., object]) -> str:
@@ -275,18 +289,19 @@ class _Copying:
 
 def _from_function(given: Callable[[np.ndarray], np.ndarray], states: np.ndarray) -> View:
     n, function = states.shape[1], _Copying(given)
+    shape = (len(states), given.size if isinstance(given, _Own) else n)
     try:
         found, alone = np.asarray(function(states)), np.asarray(function(states[:1]))
     except Exception as error:
         raise SettingError(
-            f"student_obs raised {type(error).__name__} on {states.shape} observations: "
+            f"student_obs raised {type(error).__name__} on {shape} observations: "
             f"{first_line(error)}",
             "a function (B, n) -> (B, k) of each row on its own",
             "call it on such a batch on its own, and mend it",
         ) from error
     if found.ndim != 2 or len(found) != len(states) or not np.allclose(alone[0], found[0]):
         raise SettingError(
-            f"student_obs maps {states.shape} to {found.shape}",
+            f"student_obs maps {shape} to {found.shape}",
             "a function (B, n) -> (B, k) of each row on its own",
             "index or transform the last axis only",
         )
