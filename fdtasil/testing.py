@@ -63,7 +63,8 @@ def check_student(
     """Check that a policy can be put to work in an environment.
 
     Args:
-        student: A `Student`, an exported ONNX file, or anything else that an expert may be.
+        student: A `Student`, an exported ONNX file, or anything else that an expert may be. It
+            sees the whole observation; others are judged by `fdtasil.evaluate`.
         env: As in `fdtasil.distill`.
         horizon: Steps after which an episode is cut; default: the environment's time limit.
         seed: Of three episodes of the policy.

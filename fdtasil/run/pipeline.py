@@ -143,7 +143,7 @@ def distill(
             others that resample are asked anew where there is an expert that is cheap, or
             where `probes` names them. Where `probes` names others, an expert is asked those.
         evaluation_episodes: Episodes of the paired evaluation; 0 leaves it out.
-        constraints: Name -> function of (N, n) observations and the (N, m) actions taken there,
+        constraints: Name -> function of (N, n) flat observations and the (N, m) actions taken,
             positive where the constraint is violated; the evaluation counts these steps.
         max_queries: Refuse to start a run that may ask the expert more often; where `probes` are
             left out, "fresh" is taken only if it allows that.
