@@ -8,10 +8,17 @@ from fdtasil.experts.expert import Expert
 from fdtasil.experts.gate import Finding
 from fdtasil.experts.load import ExpertLike
 from fdtasil.files.onnx.export import export_module
+from fdtasil.results.distilled import Distilled
 from fdtasil.rollouts.behaviours import has_none
 from fdtasil.rollouts.environments import Boxes, EnvironmentLike, EnvironmentPool
 from fdtasil.rollouts.episodes import Episodes
+from fdtasil.rollouts.history import WithHistory, past_size
+from fdtasil.rollouts.rollout import first_observations
+from fdtasil.run.judging import acting, check_history, finished_run, judged_in, judged_through
+from fdtasil.run.subject import named
+from fdtasil.seeding import episode_seeds
 from fdtasil.student.policy import Student
+from fdtasil.student.view import StudentObservation, View, view_size
 
 __all__ = ["Finding", "check_expert", "check_student"]
 
@@ -58,16 +65,24 @@ def check_expert(
 
 
 def check_student(
-    student: ExpertLike, env: EnvironmentLike, *, horizon: int | None = None, seed: int = 0
+    student: ExpertLike | Distilled,
+    env: EnvironmentLike,
+    *,
+    horizon: int | None = None,
+    seed: int = 0,
+    student_obs: StudentObservation | None = None,
+    history: int = 1,
 ) -> list[Finding]:
     """Check that a policy can be put to work in an environment.
 
     Args:
-        student: A `Student`, an exported ONNX file, or anything else that an expert may be. It
-            sees the whole observation; others are judged by `fdtasil.evaluate`.
+        student: A result, the folder of a run, a `Student`, an exported ONNX file, or anything
+            else that an expert may be.
         env: As in `fdtasil.distill`.
         horizon: Steps after which an episode is cut; default: the environment's time limit.
         seed: Of three episodes of the policy.
+        student_obs: What it sees, as in `fdtasil.evaluate`.
+        history: As there.
 
     Returns:
         One finding for each check: opening, answers, determinism, batch independence, large
@@ -84,13 +99,45 @@ def check_student(
         >>> [finding.name for finding in findings if finding.problem]
         ['far states']
     """
+    policy, own = finished_run(student), None
     with EnvironmentPool(env) as pool:
-        looked = look_closely(student, pool, horizon, seed, _EPISODES, with_chance=False)
+        student_obs = named(student_obs, pool.spaces.observations)
+        try:
+            source, student_obs, history = judged_through(policy, student_obs, history)
+            if isinstance(source, Student):
+                own = source
+            history = check_history(history, student_obs)
+            source = _seeing(source, pool, student_obs, history, seed)
+        except ExpertError as error:
+            return [Finding("opening", error.found, error)]
+        looked = look_closely(source, pool, horizon, seed, _EPISODES, with_chance=False)
         if looked.own is None or looked.expert is None:
             return looked.findings
         states = looked.own.spread(LOOKED_AT)
         findings = [*looked.findings, _far(looked.expert, states, pool.boxes)]
-    return [*findings, _export(student, states)] if isinstance(student, Student) else findings
+    if own is None:
+        return findings
+    return [*findings, _export(own, View.of(student_obs, states).look(states))]
+
+
+def _seeing(
+    policy: ExpertLike,
+    pool: EnvironmentPool,
+    student_obs: StudentObservation | None,
+    history: int,
+    seed: int,
+) -> Expert:
+    """Return a policy as one of all that is observed, whatever it sees of it."""
+    n, m = pool.boxes.observation_size, pool.boxes.action_size
+    size, whole = view_size(student_obs, n + past_size(history, n, m)), student_obs is None
+    judged = judged_in(policy, pool, size, whole=whole and history == 1)
+    if whole and history == 1 and judged.origin.columns is None:
+        return judged
+    if history > 1:
+        pool.wrap(lambda made: WithHistory(made, history, pool.spaces.actions))
+    first = first_observations(pool, episode_seeds(seed, "evaluation", 0, 1))
+    act = acting(judged, student_obs, first, m, purpose="check")
+    return Expert(act, judged.name, first.shape[1], m, spaces=pool.spaces)
 
 
 def _far(expert: Expert, states: np.ndarray, boxes: Boxes) -> Finding:

@@ -372,6 +372,7 @@ FAULTS = {
         351: "a card's call that lacks the module of the environment",
         352: "advice of a single student, where many were interrupted",
         353: "gains of an expert that takes dictionaries",
+        354: "a check of a student that sees a part of the observation, or a history",
     },
 }
 

@@ -12,8 +12,8 @@ import fdtasil
 # The house, floor by floor from its roof: a room may import what stands below it, and itself.
 FLOORS = [
     {"shell"},
-    {"run"},
     {"testing"},
+    {"run"},
     {"results"},
     {"student"},
     {"demonstrations"},

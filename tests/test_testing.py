@@ -3,12 +3,19 @@
 import numpy as np
 import pytest
 import torch
-from conftest import GAIN, TOY
+from conftest import GAIN, QUICK, TOY
 from test_gate import FAULTS
+from toy_forms import InForm, in_form
 
+import fdtasil
 from fdtasil.errors import ExpertError
 from fdtasil.rollouts.behaviours import farthest_apart
 from fdtasil.testing import check_expert, check_student
+
+
+def law(rows):
+    return np.clip(np.asarray(rows, np.float32) @ GAIN.T, -1, 1)
+
 
 NAMES = ["opening", "answers", "determinism", "batch independence", "large batches"]
 NAMES += ["action bounds", "action scale", "batch sizes"]
@@ -87,3 +94,23 @@ def test_a_row_without_an_answer_hides_no_fault_of_the_others(linear):
     some, none = np.float32([[1, 2], [3, 4]]), np.float32([[1, np.nan], [3, 6]])
     assert farthest_apart(some, none) == farthest_apart(none, some) == 2
     assert farthest_apart(none[:1], some[:1]) == 0
+
+
+@pytest.mark.fault(354)
+@pytest.mark.parametrize(
+    "sees",
+    [{}, {"student_obs": [0, 1, 2]}, {"student_obs": lambda rows: rows[:, :3]}, {"history": 2}],
+)
+@pytest.mark.parametrize("form", ["box", "dictionary"])
+def test_a_student_is_checked_through_what_it_sees(sees, form, tmp_path):
+    made = lambda: InForm(form)  # noqa: E731
+    result = fdtasil.distill(in_form(law, form, "box"), made, 0, **QUICK, **sees)
+    named = [*NAMES, "far states", "export"]
+    for student, about in ((result, {}), (result.student, sees)):
+        findings = check_student(student, made, horizon=20, **about)
+        assert [finding.name for finding in findings] == named
+        assert problems(findings) == {}
+    if not callable(sees.get("student_obs")):
+        assert problems(check_student(result.save(tmp_path / "run"), made, horizon=20)) == {}
+        file = result.export(tmp_path / "s.onnx")
+        assert problems(check_student(file, made, horizon=20)) == {}
