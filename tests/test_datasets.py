@@ -21,7 +21,7 @@ from fdtasil.errors import ExpertError, FdtasilWarning, SettingError, StorageErr
 from fdtasil.probes.answers import Answers
 from fdtasil.results.card import card_of
 from fdtasil.results.page import page_of
-from fdtasil.student.view import View
+from fdtasil.student.view import View, sees_as
 
 
 def never(observations):
@@ -274,12 +274,22 @@ def test_a_result_is_judged_through_what_it_sees_alone(linear, tmp_path):
         )
     folder, file = result.save(tmp_path / "run"), result.export(tmp_path / "s.onnx")
     for policy in (result, folder, file):
-        for other in ([2, 3], [1, 0], lambda rows: rows[:, 2:4]):
+        for other in ([2, 3], [1, 0], [0, 1, 2], lambda rows: rows[:, 2:4]):
             with pytest.raises(SettingError, match=r"as the (student was trained|file says)"):
                 fdtasil.evaluate(policy, linear, TOY, student_obs=other, **about)
     whole = fdtasil.distill(linear, TOY, 0, **QUICK)
     with pytest.raises(SettingError, match="the whole observation: 5 numbers"):
         fdtasil.evaluate(whole, linear, TOY, student_obs=backwards, **about)
+
+
+@pytest.mark.fault(332)
+def test_views_of_large_numbers_that_differ_by_little_are_others():
+    """Two barometers, which vary by half a pascal."""
+    states = 101_325 + np.random.default_rng(0).normal(0, 0.5, (50, 3))
+    first = View.of([0, 1], states)
+    assert sees_as(first, View.of(lambda rows: rows[:, :2] * 1.0, states), states)
+    assert not sees_as(first, View.of(lambda rows: rows[:, [1, 0]], states), states)
+    assert not sees_as(first, View.of([1, 0], states), states)
 
 
 @pytest.mark.fault(333)
@@ -807,6 +817,15 @@ def test_no_path_is_refused_by_every_writer(quick):
     for write in (quick.export, quick.to_onnx, quick.save):
         with pytest.raises(SettingError, match="None"):
             write(None)
+
+
+def test_a_constraint_may_know_nothing_of_actions_that_nobody_takes(linear):
+    push = lambda rows: np.full((len(rows), 2), 0.5)  # noqa: E731
+    limits = {"power": lambda x, u: np.where(np.abs(u[:, 0] - 0.5) < 0.3, -1.0, np.nan)}
+    fdtasil.evaluate(push, push, TOY, episodes=2, horizon=5, constraints=limits)
+    run = QUICK | {"fit": Fit(steps=300, learning_rate=0.01)}
+    found = fdtasil.distill(push, TOY, 0, constraints=limits, **run)
+    assert found.evaluation.violations[0][1] == 0
 
 
 @pytest.mark.fault(350)

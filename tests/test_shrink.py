@@ -270,7 +270,10 @@ def test_another_environment_than_the_runs_is_told_of(linear):
 
 
 @pytest.mark.fault(344)
-def test_nobody_to_judge_by_is_refused_at_once(run):
+def test_nobody_to_judge_by_is_refused_at_once(run, tmp_path):
+    with pytest.raises(SettingError, match="horizon") as early:
+        fdtasil.shrink(run, law, TOY, **{**FAST, "horizon": -1}, out=tmp_path / "none")
+    assert not getattr(early.value, "__notes__", [])
     for expert, env in ((None, TOY), (law, None)):
         with pytest.raises(SettingError, match="to judge students with"):
             fdtasil.shrink(run, expert, env, **FAST)
@@ -280,12 +283,12 @@ def test_nobody_to_judge_by_is_refused_at_once(run):
 def test_students_are_trained_as_the_runs_was(run):
     fit = fdtasil.Fit(epochs=2, weight=0.1, batch_size=50, learning_rate=0.002)
     one = fdtasil.distill(law, TOY, 2, **{**QUICK, "fit": fit})
-    options = {**FAST, "sizes": [(3,)], "cloned": False, "keep": 0.0}
+    options = {**FAST, "sizes": np.array([[3]]), "cloned": False, "keep": 0.0}
     found = fdtasil.shrink(one, law, TOY, **options)
     assert found.result.settings["fit"] == one.settings["fit"]
-    usual = fdtasil.distill(law, TOY, 2, **{**QUICK, "fit": None})
-    written = fdtasil.shrink(usual, law, TOY, **options, fit=None).result.settings["fit"]
-    assert written == usual.settings["fit"]
+    for anew in (False, True):
+        for said in (fdtasil.Fit(), fdtasil.Fit(steps=40), fit):
+            assert fdtasil.Fit.from_json(said.to_json(anew=anew), anew=anew) == said
 
 
 @pytest.mark.fault(345)

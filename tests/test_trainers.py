@@ -16,6 +16,7 @@ from fdtasil.demonstrations.trainers import (
     Dart,
     NoisyExpert,
     Situation,
+    describe_trainer,
     trainer_of,
 )
 from fdtasil.errors import FdtasilWarning, SettingError
@@ -312,6 +313,12 @@ class Slots:
     given = None
     decision = None
     behaviour, queries = Own.behaviour, Own.queries
+
+
+@pytest.mark.fault(340)
+def test_a_trainer_is_described_whole():
+    long = DAgger(updates=range(1, 100), beta=np.float64(0.5))
+    assert describe_trainer(long, 100) == f"dagger,updates={(*range(1, 100),)}"
 
 
 @pytest.mark.fault(341)

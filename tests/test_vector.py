@@ -15,7 +15,7 @@ from stable_baselines3.common.vec_env import (
     VecFrameStack,
     VecNormalize,
 )
-from toy_environments import Jumps
+from toy_environments import Integrator, Jumps
 from toy_forms import InForm, in_form
 
 import fdtasil
@@ -199,6 +199,42 @@ def test_a_silent_physics_reset_is_counted_in_each(kind):
     ):
         found, expected = (rollout(idle, one, [1, 2, 3], 12) for one in (pool, alone))
     assert found.physics_resets.tolist() == expected.physics_resets.tolist() == [2, 2, 2]
+
+
+class Batched(SyncVectorEnv):
+    """One whose `envs` are no environments, and whose info is none."""
+
+    def __init__(self):
+        super().__init__([Integrator] * 2)
+        self.inner, self.envs = self.envs, 2
+
+    def step(self, actions):
+        self.envs = self.inner
+        found = super().step(actions)
+        self.envs = 2
+        return *found[:4], None
+
+    def reset(self, **named):
+        self.envs = self.inner
+        found = super().reset(**named)
+        self.envs = 2
+        return found
+
+
+def test_what_is_called_envs_may_be_something_else():
+    idle = follow(lambda rows: np.zeros((len(rows), 2), np.float32))
+    with EnvironmentPool(Batched()) as pool, EnvironmentPool(Integrator) as alone:
+        found, expected = (rollout(idle, one, [1, 2], 12) for one in (pool, alone))
+    assert np.array_equal(found.observations, expected.observations)
+
+
+def test_wrappers_of_copies_in_processes_are_kept():
+    kwargs = {"wrappers": [lambda env: gymnasium.wrappers.TransformReward(env, lambda r: 2 * r)]}
+    doubled = fdtasil.Environment("toy_environments:toy/Walled-v0", kwargs, num_envs=2)
+    idle = follow(lambda rows: np.zeros((len(rows), 2), np.float32))
+    with EnvironmentPool(doubled) as pool, EnvironmentPool(doubled.environment) as alone:
+        found, expected = (rollout(idle, one, [1, 2], 5) for one in (pool, alone))
+    assert np.allclose(found.rewards, 2 * expected.rewards)
 
 
 @pytest.mark.fault(337)

@@ -10,7 +10,7 @@ from typing import Any, Literal, Protocol
 import numpy as np
 
 from fdtasil.checks import check_choice, check_count, check_number, check_share, spelt
-from fdtasil.errors import SettingError, in_one_line, shown, warn
+from fdtasil.errors import SettingError, shown, warn
 from fdtasil.experts.expert import Expert
 from fdtasil.rollouts.behaviours import Behaviour, Decision, Policy, has_none, silent_rows
 from fdtasil.rollouts.episodes import Episodes
@@ -122,7 +122,7 @@ class DAgger:
         object.__setattr__(self, "updates", _checked_updates(self.updates))
         check_choice("mix", self.mix, ("blend", "switch"))
         if not callable(self.beta):
-            check_share("beta", self.beta)
+            object.__setattr__(self, "beta", check_share("beta", self.beta))
 
     def share(self, round_: int) -> float:
         """Return the expert's share in a round."""
@@ -352,7 +352,8 @@ def _settings(trainer: Trainer) -> dict[str, str]:
     values = {name: getattr(trainer, name) for name in slots} | getattr(trainer, "__dict__", {})
     texts = {name: getattr(one, "__name__", None) or repr(one) for name, one in values.items()}
     texts.pop("name", None)
-    return {name: _ADDRESS.sub("", in_one_line(text)) for name, text in texts.items()}
+    # Whole: what a run is gone on with is compared by it.
+    return {name: _ADDRESS.sub("", " ".join(text.split())) for name, text in texts.items()}
 
 
 def rounds_of(trainer: Trainer, episodes: int) -> list[int]:

@@ -75,7 +75,8 @@ def try_constraints(
     """
     own = states[:, : pool.spaces.observations.size]
     for name, constraint in constraints.items():
-        _values(name, constraint, own, actions, pool)
+        with np.errstate(all="ignore"):  # nobody takes these actions
+            _values(name, constraint, own, actions, pool, taken=False)
 
 
 def _values(
@@ -84,6 +85,8 @@ def _values(
     states: np.ndarray,
     actions: np.ndarray,
     pool: EnvironmentPool,
+    *,
+    taken: bool = True,
 ) -> np.ndarray:
     try:
         found = np.asarray(constraint(states.copy(), actions.copy()), np.float64)
@@ -92,7 +95,7 @@ def _values(
         order = pool.spaces.observations.order
         flat = f"; an observation is {order}" if order else ""
         raise SettingError(said, f"{_CONSTRAINTS}{flat}", _LIMIT) from error
-    if found.shape != (len(states),) or np.isnan(found).any():
+    if found.shape != (len(states),) or (taken and np.isnan(found).any()):
         nan = "NaN in " if np.isnan(found).any() else ""
         said = f"constraints: {name!r} returned {nan}shape {found.shape}"
         raise SettingError(said, f"({len(states)},) numbers, positive where violated", _LIMIT)

@@ -26,8 +26,8 @@ class TogetherStep(NamedTuple):
         rewards: (N,).
         terminated: (N,) bool.
         truncated: (N,) bool.
-        reset: (N,) bool, whose simulation MuJoCo reset inside the step, as far as it is known; of
-            an episode that is over, it is not.
+        reset: (N,) bool, whose simulation MuJoCo reset inside the step, as far as it is known;
+            where the next episode begins in the last step of one, it is not known of that.
     """
 
     observations: Any
@@ -99,7 +99,8 @@ class _Gymnasium:
         self._over = np.zeros(self.count, bool)
         self._options: dict[str, Any] = {}
         self._each, self._like = True, None
-        self._simulations = _Simulations(getattr(env.unwrapped, "envs", ()))
+        self._simulations = _Simulations(env.unwrapped, self.count)
+        self._anew = env.metadata.get("autoreset_mode") == modes.SAME_STEP
 
     def reset(self, seeds: Sequence[int], options: Any) -> Any:
         self._over[:], self._options = False, dict(options or {})
@@ -124,8 +125,10 @@ class _Gymnasium:
             raise ChildProcessError("one of its processes has ended") from error
         rewards, terminated, truncated = map(to_numpy, (rewards, terminated, truncated))
         self._over = np.logical_or(terminated, truncated)
-        told = np.asarray(info[RESET], bool) if RESET in info else False
-        reset = (self._simulations.reset(self.count) | told) & ~self._over
+        told = np.asarray(info[RESET], bool) if isinstance(info, dict) and RESET in info else False
+        reset = self._simulations.reset() | told
+        if self._anew:  # the clock went back for the next episode
+            reset &= ~self._over
         return TogetherStep(observations, rewards, terminated, truncated, reset)
 
     def close(self) -> None:
@@ -136,6 +139,8 @@ class _Gymnasium:
             return
         try:
             self._env.close(timeout=_PATIENCE)  # a step that is under way is waited for
+        except TypeError:  # of a wrapper whose close() takes nothing
+            self._env.close()
         except (EOFError, OSError):  # of a worker that is gone
             inner.closed = True
         finally:
@@ -168,7 +173,7 @@ class _Sb3:
         self._innermost = env
         while hasattr(self._innermost, "venv"):
             self._innermost = self._innermost.venv
-        self._simulations = _Simulations(getattr(self._innermost, "envs", ()))
+        self._simulations = _Simulations(self._innermost, self.count)
 
     def reset(self, seeds: Sequence[int], options: Any) -> Any:
         # Its own seed() takes one for all; each environment's is what it hands on.
@@ -186,7 +191,7 @@ class _Sb3:
             raise ChildProcessError("one of its processes has ended") from error
         late = np.array([bool(info.get("TimeLimit.truncated", False)) for info in infos])
         over = np.asarray(done, bool)
-        reset = self._simulations.reset(self.count) & ~over
+        reset = self._simulations.reset() & ~over  # whose clock went back for the next episode
         return TogetherStep(
             observations, np.asarray(rewards, np.float64), over & ~late, over & late, reset
         )
@@ -208,11 +213,15 @@ class _Simulations:
     """MuJoCo's simulations of environments that step together in this process.
 
     Args:
-        environments: One for each episode; empty where they are elsewhere.
+        environment: The innermost vector environment.
+        count: Of its environments.
     """
 
-    def __init__(self, environments: Sequence[Any]) -> None:
-        self._environments = environments
+    def __init__(self, environment: Any, count: int) -> None:
+        inside = getattr(environment, "envs", None)
+        listed = list(inside) if isinstance(inside, list | tuple) else []
+        known = len(listed) == count and all(isinstance(one, gymnasium.Env) for one in listed)
+        self._environments, self._count = listed if known else [], count
         self._data: list[object] = []
 
     def begin(self) -> None:
@@ -220,12 +229,12 @@ class _Simulations:
         self._data = [data_of(one) for one in self._environments]
         self._clocks, self._first = [clock(one) for one in self._data], True
 
-    def reset(self, count: int) -> np.ndarray:
-        """Return (N,) bool, which of `count` were reset in the last step."""
+    def reset(self) -> np.ndarray:
+        """Return (N,) bool, which were reset in the last step, as far as it is known."""
         pairs = zip(self._data, self._clocks, strict=True)
         found = [was_reset(data, before, first=self._first) for data, before in pairs]
         self._clocks, self._first = [clock(one) for one in self._data], False
-        return np.array(found, bool) if found else np.zeros(count, bool)
+        return np.array(found, bool) if found else np.zeros(self._count, bool)
 
 
 def _end(workers: Sequence[Any]) -> None:
@@ -277,5 +286,6 @@ def make_vector(name: str, count: int, kwargs: dict[str, Any]) -> gymnasium.vect
     module, colon, _ = name.partition(":")
     if colon:
         importlib.import_module(module)
-    told = [TellsResets]
-    return gymnasium.make_vec(name, count, vectorization_mode="async", wrappers=told, **kwargs)
+    wrappers = [*kwargs.get("wrappers", ()), TellsResets]
+    kwargs = {**kwargs, "wrappers": wrappers, "vectorization_mode": "async"}
+    return gymnasium.make_vec(name, count, **kwargs)

@@ -83,7 +83,7 @@ def open_run_folder(
             raise SettingError(
                 f"{path} holds a run that has not ended",
                 "an empty folder, or a finished run (which is replaced)",
-                f"{going_on}; choose another folder, or remove this one",
+                f"{going_on}, or choose another folder",
             )
         try:
             yield folder

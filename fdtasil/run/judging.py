@@ -156,8 +156,9 @@ def acting(
     """
     says = judged.origin.columns
     seen = says if student_obs is None else student_obs
-    view = View.of(visible(seen, states.shape[1], remembered), states[:256])
-    if says is not None and not sees_as(view, View.of(says, states), states):
+    few = states[:256]
+    view = View.of(visible(seen, states.shape[1], remembered), few)
+    if says is not None and not sees_as(view, View.of(says, few), few):
         raise SettingError(
             f"student_obs={describe_view(student_obs, states.shape[1])} of {judged.name}",
             f"{list(says)}, as the file says itself",

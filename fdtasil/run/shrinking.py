@@ -1,7 +1,7 @@
 """The smallest student that keeps the expert's level, from the answers that are there."""
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import partial
@@ -136,7 +136,7 @@ def shrink(
     found = dict[_Job, Distilled]()
     count, bars = len(jobs) * (1 + cloned), Progress(check_flag("progress", progress))
     with (
-        _going_on(folder),
+        _going_on(folder, found),
         _place_of(folder, workers) as place,
         bars.bar("students", "student", count) as bar,
     ):
@@ -161,7 +161,8 @@ def shrink(
 
 def fit_of(result: Distilled) -> Fit:
     """Return how the student of a run was trained."""
-    return Fit.from_json(result.settings["fit"])
+    anew = "resample" in result.settings["probes"]
+    return Fit.from_json(result.settings["fit"], anew=anew)
 
 
 def _seen(result: Distilled) -> tuple[int, ...] | None:
@@ -209,33 +210,39 @@ class _Job:
 
 def _jobs(sizes: Sequence[tuple[int, ...]], activations: Sequence[str]) -> list[_Job]:
     """Return the students with probes; what can't be built is refused before anything is."""
-    listed = isinstance(sizes, Sequence) and not isinstance(sizes, str)
-    if not listed or not all(isinstance(one, Sequence) for one in sizes):
-        raise SettingError(
-            spelt("sizes", sizes),
-            "the hidden layers of each student, (64, 64) for two of 64 units",
-            "write for example sizes=[(32,), (64, 64)]",
-        )
+    wrong = SettingError(
+        spelt("sizes", sizes),
+        "the hidden layers of each student, each once; (64, 64) are two layers of 64 units",
+        "write for example sizes=[(32,), (64, 64)]",
+    )
+    try:
+        listed = list(sizes)
+    except TypeError:
+        raise wrong from None
     jobs = []
-    for hidden in sizes:
+    for hidden in listed:
         for activation in activations:
             widths = Mlp(hidden, activation).hidden
             assert isinstance(widths, tuple)
             jobs.append(_Job(widths, activation))
     if not jobs:
         raise SettingError("no sizes", "one student at least", "leave sizes= out")
+    if len(set(jobs)) < len(jobs):  # (64, 64) in the place of [(64, 64)]
+        raise wrong
     return jobs
 
 
 @contextmanager
-def _going_on(folder: Path | None) -> Iterator[None]:
+def _going_on(folder: Path | None, found: Mapping[_Job, Distilled]) -> Iterator[None]:
     """Say how to go on after an interruption: what a student's own run advises is of it alone."""
     try:
         yield
     except BaseException as error:
-        notes = [one for one in getattr(error, "__notes__", []) if not one.startswith(KEPT)]
-        again = f"{KEPT} in {folder}: the same call again goes on with it"
-        error.__notes__ = notes if folder is None else [*notes, again]
+        said = getattr(error, "__notes__", [])
+        notes = [one for one in said if not one.startswith(KEPT)]
+        if folder is not None and (found or len(notes) < len(said)):
+            notes.append(f"{KEPT} in {folder}: the same call again goes on with it")
+        error.__notes__ = notes
         raise
 
 

@@ -113,12 +113,13 @@ class Fit:
         return {**asdict(self), **rule}
 
     @classmethod
-    def from_json(cls, written: Mapping[str, Any]) -> "Fit":
-        """Read what `to_json` returned; a usual length and its rate are left out again."""
+    def from_json(cls, written: Mapping[str, Any], *, anew: bool = False) -> "Fit":
+        """Read what `to_json` returned; a usual length and a usual rate are left out again."""
         known = {name: written[name] for name in cls.__dataclass_fields__ if name in written}
         if written.get("steps_for") is not None:
-            usual = known["learning_rate"] in (USUAL.learning_rate, ANEW.learning_rate)
-            known |= {"steps": None} | ({"learning_rate": None} if usual else {})
+            known["steps"] = None
+        if known["learning_rate"] == (ANEW if anew else USUAL).learning_rate:
+            known["learning_rate"] = None
         return cls(**known)
 
     def schedule(self, *, anew: bool = False) -> Schedule:

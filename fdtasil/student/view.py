@@ -191,10 +191,20 @@ def _rounding(
 
 def sees_as(one: View, other: View, states: np.ndarray) -> bool:
     """Whether two views of (B, n) states, and of states around them, are the same."""
+    n = states.shape[1]
+    chosen = [(*range(n),) if view.is_whole else view.columns for view in (one, other)]
+    if None not in chosen or one.size != other.size:
+        return chosen[0] == chosen[1] and one.size == other.size
     spread = np.maximum(states.std(axis=0), _LEAST_SPREAD)
     noise = np.random.default_rng(0).standard_normal(states.shape) * spread
     around = np.concatenate([states, (states + noise).astype(states.dtype)])
-    return np.allclose(one.look(around), other.look(around), equal_nan=True)
+    ours, theirs = (np.asarray(view.look(around), np.float64) for view in (one, other))
+    # Beside how far they go: a pressure's tenth of a per mille is more than it varies.
+    near = _SAME * theirs.std(axis=0) + _ROUNDINGS * np.spacing(
+        np.abs(theirs).max(axis=0).astype(np.float32)
+    )
+    apart = np.abs(ours - theirs)
+    return bool(((apart <= near) | (np.isnan(ours) & np.isnan(theirs))).all())
 
 
 def view_size(student_obs: StudentObservation | None, n: int) -> int | None:
