@@ -12,13 +12,13 @@ from fdtasil.results.distilled import Distilled
 from fdtasil.rollouts.behaviours import has_none
 from fdtasil.rollouts.environments import Boxes, EnvironmentLike, EnvironmentPool
 from fdtasil.rollouts.episodes import Episodes
-from fdtasil.rollouts.history import WithHistory, past_size
+from fdtasil.rollouts.history import WithHistory
 from fdtasil.rollouts.rollout import first_observations
 from fdtasil.run.judging import acting, check_history, finished_run, judged_in, judged_through
 from fdtasil.run.subject import named
 from fdtasil.seeding import episode_seeds
 from fdtasil.student.policy import Student
-from fdtasil.student.view import StudentObservation, View, view_size
+from fdtasil.student.view import StudentObservation, View
 
 __all__ = ["Finding", "check_expert", "check_student"]
 
@@ -128,14 +128,13 @@ def _seeing(
     seed: int,
 ) -> Expert:
     """Return a policy as one of all that is observed, whatever it sees of it."""
-    n, m = pool.boxes.observation_size, pool.boxes.action_size
-    size, whole = view_size(student_obs, n + past_size(history, n, m)), student_obs is None
-    judged = judged_in(policy, pool, size, whole=whole and history == 1)
-    if whole and history == 1 and judged.origin.columns is None:
+    judged = judged_in(policy, pool, student_obs, history)
+    if student_obs is None and history == 1 and judged.origin.columns is None:
         return judged
     if history > 1:
         pool.wrap(lambda made: WithHistory(made, history, pool.spaces.actions))
     first = first_observations(pool, episode_seeds(seed, "evaluation", 0, 1))
+    m = pool.boxes.action_size
     act = acting(judged, student_obs, first, m, purpose="check")
     return Expert(act, judged.name, first.shape[1], m, spaces=pool.spaces)
 

@@ -4,6 +4,8 @@ import html
 from dataclasses import dataclass
 from typing import Any
 
+import numpy as np
+
 from fdtasil.errors import FdtasilError, printable
 from fdtasil.experts.gate import Finding
 from fdtasil.files.plain import to_plain, without_infinities
@@ -101,8 +103,7 @@ class Inspection:
         if self.chance is None:
             return []
         count = len(self.returns)
-        mean = sum(self.returns) / count
-        deviation = (sum((one - mean) ** 2 for one in self.returns) / count) ** 0.5
+        mean, deviation = float(np.mean(self.returns)), float(np.std(self.returns))
         doubt = _CHANCE if mean <= self.chance else ""
         return [
             ("return", f"{mean:.1f} +- {deviation:.1f} over {count} episodes"),

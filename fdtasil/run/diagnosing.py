@@ -31,7 +31,6 @@ from fdtasil.rollouts.environments import (
     simulator_warnings,
 )
 from fdtasil.rollouts.episodes import Episodes
-from fdtasil.rollouts.history import past_size
 from fdtasil.rollouts.rollout import rollout
 from fdtasil.run.judging import (
     acting,
@@ -43,7 +42,7 @@ from fdtasil.run.judging import (
 )
 from fdtasil.run.presets import PRESETS
 from fdtasil.seeding import episode_seeds, generator
-from fdtasil.student.view import StudentObservation, view_size
+from fdtasil.student.view import StudentObservation
 
 __all__ = ["diagnose"]
 
@@ -144,9 +143,7 @@ def _opened(
     history: int,
 ) -> tuple[Expert, Expert]:
     """Return both policies, neither of which has a memory, in a pool that shows the past."""
-    asked, n, m = expert_in(expert, pool), pool.boxes.observation_size, pool.boxes.action_size
-    size, whole = n + past_size(history, n, m), student_obs is None and history == 1
-    judged = judged_in(student, pool, view_size(student_obs, size), whole=whole)
+    asked, judged = expert_in(expert, pool), judged_in(student, pool, student_obs, history)
     if asked.memory is not None or judged.memory is not None:
         raise SettingError(
             "a policy with a memory", "two that depend on the observation", "see evaluate()"

@@ -16,7 +16,6 @@ from fdtasil.results.evaluation import Evaluation
 from fdtasil.results.pair import evaluate_pair
 from fdtasil.rollouts.behaviours import follow_answers
 from fdtasil.rollouts.environments import EnvironmentLike, EnvironmentPool, resolve_horizon
-from fdtasil.rollouts.history import past_size
 from fdtasil.run.judging import (
     acting,
     check_history,
@@ -28,7 +27,7 @@ from fdtasil.run.judging import (
 )
 from fdtasil.run.subject import named
 from fdtasil.seeding import episode_seeds
-from fdtasil.student.view import StudentObservation, view_size
+from fdtasil.student.view import StudentObservation
 
 __all__ = ["evaluate"]
 
@@ -89,8 +88,7 @@ def evaluate(
         looked_at, student_obs, history = judged_through(policy, student_obs, history)
         history = check_history(history, student_obs)
         black_box, length = expert_in(expert, pool), resolve_horizon(horizon, pool)
-        seen_size = view_size(student_obs, n + past_size(history, n, m))
-        judged = judged_in(looked_at, pool, seen_size, whole=student_obs is None and history == 1)
+        judged = judged_in(looked_at, pool, student_obs, history)
         if judged.memory is not None:
             raise SettingError(
                 f"{judged.name}, which has a memory, to be judged",

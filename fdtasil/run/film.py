@@ -33,7 +33,6 @@ from fdtasil.rollouts.rollout import first_observations
 from fdtasil.rollouts.stepping import step_by_step
 from fdtasil.rollouts.wanted import Environment
 from fdtasil.run.judging import acting, finished_run, judged_in, judged_through
-from fdtasil.student.view import view_size
 
 __all__ = ["choose_renderer", "render"]
 
@@ -234,12 +233,11 @@ def _drawing(env: EnvironmentLike) -> EnvironmentLike:
 def _policy_in(policy: ExpertLike | Distilled, pool: EnvironmentPool, seed: int) -> Policy:
     """Return what answers the environment's flat observations."""
     looked_at, student_obs, history = judged_through(finished_run(policy), None, 1)
+    judged = judged_in(looked_at, pool, student_obs, history)
     if history > 1:
         layout = pool.spaces.actions
         pool.wrap(lambda made: WithHistory(made, history, layout))
     n, m = pool.boxes.observation_size, pool.boxes.action_size
-    whole = student_obs is None and history == 1
-    judged = judged_in(looked_at, pool, view_size(student_obs, n), whole=whole)
     if student_obs is None and judged.origin.columns is None:
         opened, _, _ = carry(sized(judged, n, m), pool)
         return opened.policy("evaluate")

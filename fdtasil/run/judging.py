@@ -17,6 +17,7 @@ from fdtasil.files.run_format import WEIGHTS
 from fdtasil.results.distilled import Distilled, given_view
 from fdtasil.rollouts.behaviours import Policy
 from fdtasil.rollouts.environments import EnvironmentPool
+from fdtasil.rollouts.history import past_size
 from fdtasil.rollouts.spaces import Spaces, flat_layout
 from fdtasil.rollouts.trials import fingerprint, other_environment
 from fdtasil.student.policy import Student
@@ -26,6 +27,7 @@ from fdtasil.student.view import (
     View,
     describe_view,
     sees_as,
+    view_size,
     visible,
 )
 
@@ -119,14 +121,26 @@ def judged_through(
 
 
 def judged_in(
-    policy: ExpertLike, pool: EnvironmentPool, size: int | None, *, whole: bool
+    policy: ExpertLike,
+    pool: EnvironmentPool,
+    student_obs: StudentObservation | None,
+    history: int,
 ) -> Expert:
-    """Open a policy that is judged; one that sees a part of the observation takes flat rows."""
-    spaces = pool.spaces.unless_plain
-    judged = open_expert(policy, Hints(size, pool.boxes.action_size, spaces=spaces))
+    """Open a policy that is judged; one that sees a part of the observation takes flat rows.
+
+    Args:
+        policy: From `judged_through`.
+        pool: The environment, which shows the present alone.
+        student_obs: From `judged_through`.
+        history: From `judged_through`.
+    """
+    spaces, n, m = pool.spaces.unless_plain, pool.boxes.observation_size, pool.boxes.action_size
+    size = view_size(student_obs, n + past_size(history, n, m))
+    judged = open_expert(policy, Hints(size, m, spaces=spaces))
     if isinstance(policy, Student):
         own = {"observation_size": policy.observation_size, "action_size": policy.action_size}
         judged = replace(judged, **own)
+    whole = student_obs is None and history == 1
     if spaces is not None and (not whole or judged.origin.columns is not None):
         spaces = Spaces(flat_layout(size or 1), spaces.actions)
     return in_spaces(judged, spaces)

@@ -10,7 +10,7 @@ from fdtasil.experts.load import ExpertLike, expert_in, load_expert
 from fdtasil.files.reading import from_json
 from fdtasil.results.distilled import Distilled
 from fdtasil.rollouts.environments import EnvironmentPool
-from fdtasil.rollouts.wanted import Environment
+from fdtasil.rollouts.wanted import Environment, import_module_of
 from fdtasil.run.events import Log
 from fdtasil.run.pipeline import distill
 from fdtasil.run.presets import preset_of
@@ -25,6 +25,7 @@ __all__ = [
     "distil",
     "judged",
     "opened",
+    "opened_in",
     "seen",
     "wanted",
 ]
@@ -78,6 +79,26 @@ def _object(name: str, text: str | None) -> dict[str, Any] | None:
         example = f"""write {flag} '{{"name": 1.0}}'"""
         raise SettingError(f"{name}={shown(text)!r}", "a JSON object", example)
     return found
+
+
+def opened_in(
+    arguments: dict[str, Any], made: Mapping[str, object] = MADE_FLAGS
+) -> tuple[ExpertLike, Environment | str]:
+    """Take expert and environment out of a command's arguments, opened and made as flags say.
+
+    Args:
+        arguments: By name; those that are of the two are removed.
+        made: The flags that say how the environment is made.
+
+    Raises:
+        ExpertError: If the expert can't be opened.
+        SettingError: If a text is no JSON object.
+    """
+    env = arguments.pop("env")
+    import_module_of(env)
+    place = wanted(env, *(arguments.pop(name) for name in made))
+    how = {name: arguments.pop(name) for name in ("output", "inputs", "trust")}
+    return opened(arguments.pop("expert"), place, **how), place
 
 
 def distil(arguments: Arguments, *, progress: bool = True) -> Distilled:

@@ -3,9 +3,8 @@
 from pathlib import Path
 from typing import Any
 
-from fdtasil.rollouts.wanted import import_module_of
 from fdtasil.run.diagnosing import diagnose
-from fdtasil.shell.call import EXPERT_FLAGS, MADE_FLAGS, judged, opened, wanted
+from fdtasil.shell.call import EXPERT_FLAGS, MADE_FLAGS, judged, opened_in
 from fdtasil.shell.command import EnvironmentId, Flags, PolicyPath, as_command
 from fdtasil.shell.saying import JSON_FLAG, json_file, say
 
@@ -14,20 +13,11 @@ __all__ = ["command"]
 
 def _diagnose(
     student: str,
-    expert: str,
-    env: str,
-    output: str | None,
-    inputs: str | None,
-    trust: Any,
     json: Path | None,
-    env_kwargs: str | None,
-    reset_options: str | None,
     **arguments: Any,
 ) -> None:
-    file = json_file(json)
-    import_module_of(env)
-    place = wanted(env, env_kwargs, reset_options)
-    asked = opened(expert, place, output=output, inputs=inputs, trust=trust)
+    file, trust = json_file(json), arguments["trust"]
+    asked, place = opened_in(arguments)
     say(diagnose(judged(student, trust), asked, place, **arguments), file)
 
 

@@ -6,9 +6,8 @@ from typing import Any
 from fdtasil.checks import check_suffix
 from fdtasil.files.storage import write_bytes
 from fdtasil.results.figures import draw_calibration
-from fdtasil.rollouts.wanted import import_module_of
 from fdtasil.run.inspecting import inspect
-from fdtasil.shell.call import EXPERT_FLAGS, MADE_FLAGS, opened, wanted
+from fdtasil.shell.call import EXPERT_FLAGS, MADE_FLAGS, opened_in
 from fdtasil.shell.command import EnvironmentId, ExpertPath, Flags, OptionalPath, as_command
 from fdtasil.shell.saying import JSON_FLAG, json_file, say
 
@@ -20,23 +19,14 @@ _PICTURE_FLAG: dict[str, tuple[Any, Any, str]] = {
 
 
 def _inspect(
-    expert: str,
-    env: str,
-    output: str | None,
-    inputs: str | None,
-    trust: Any,
     json: Path | None,
     picture: Path | None,
-    env_kwargs: str | None,
-    reset_options: str | None,
     **arguments: Any,
 ) -> None:
     # Absolute from the beginning: an environment may change the working folder.
     drawn = None if picture is None else check_suffix(picture, ".png").absolute()
     file = json_file(json)
-    import_module_of(env)
-    place = wanted(env, env_kwargs, reset_options)
-    source = opened(expert, place, output=output, inputs=inputs, trust=trust)
+    source, place = opened_in(arguments)
     found = inspect(source, place, **arguments)
     if drawn is not None and found.calibration is not None:
         write_bytes(drawn, draw_calibration(found.calibration))

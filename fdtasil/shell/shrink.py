@@ -6,9 +6,8 @@ from pathlib import Path
 from typing import Any
 
 from fdtasil.results.distilled import Distilled
-from fdtasil.rollouts.wanted import import_module_of
 from fdtasil.run.shrinking import LADDER, fit_of, shrink
-from fdtasil.shell.call import EXPERT_FLAGS, MADE_FLAGS, opened, wanted
+from fdtasil.shell.call import EXPERT_FLAGS, MADE_FLAGS, opened_in
 from fdtasil.shell.command import (
     EnvironmentId,
     ExpertPath,
@@ -24,23 +23,14 @@ __all__ = ["command"]
 
 def _shrink(
     run: Path,
-    expert: str,
-    env: str,
     out: Path | None,
     widths: tuple[int, ...],
     layers: int,
     steps: int | None,
-    output: str | None,
-    inputs: str | None,
-    trust: Any,
-    env_kwargs: str | None,
-    reset_options: str | None,
     **arguments: Any,
 ) -> None:
     place_of_runs = run.parent / f"{run.name}-shrunk" if out is None else out
-    import_module_of(env)
-    place = wanted(env, env_kwargs, reset_options)
-    asked = opened(expert, place, output=output, inputs=inputs, trust=trust)
+    asked, place = opened_in(arguments)
     result = Distilled.load(run)
     found = shrink(
         result,

@@ -29,8 +29,6 @@ StudentObservation = Sequence[int] | Sequence[str] | Callable[[np.ndarray], np.n
 
 _ROUNDINGS = 4  # of float32, in the difference of two steps
 _SAME = 1e-4  # relative; beyond the rounding of float32, below any nonlinearity worth the name
-
-
 _LEAST_SPREAD = 1e-3  # of a coordinate that does not change
 
 
@@ -193,8 +191,10 @@ def sees_as(one: View, other: View, states: np.ndarray) -> bool:
     """Whether two views of (B, n) states, and of states around them, are the same."""
     n = states.shape[1]
     chosen = [(*range(n),) if view.is_whole else view.columns for view in (one, other)]
-    if None not in chosen or one.size != other.size:
-        return chosen[0] == chosen[1] and one.size == other.size
+    if one.size != other.size:
+        return False
+    if None not in chosen:
+        return chosen[0] == chosen[1]
     spread = np.maximum(states.std(axis=0), _LEAST_SPREAD)
     noise = np.random.default_rng(0).standard_normal(states.shape) * spread
     around = np.concatenate([states, (states + noise).astype(states.dtype)])
@@ -256,14 +256,18 @@ class _Own:
 
     @property
     def __name__(self) -> str:
-        return getattr(self.function, "__name__", type(self.function).__name__)
+        return _name_of(self.function)
 
     def __call__(self, rows: np.ndarray) -> np.ndarray:
         return self.function(rows[:, : self.size])
 
 
 def _called(function: Callable[..., object]) -> str:
-    return f"the function {getattr(function, '__name__', type(function).__name__)}"
+    return f"the function {_name_of(function)}"
+
+
+def _name_of(function: Callable[..., object]) -> str:
+    return getattr(function, "__name__", type(function).__name__)
 
 
 def _indices(student_obs: object, n: int) -> tuple[int, ...]:
@@ -291,7 +295,7 @@ class _Copying:
 
     @property
     def __name__(self) -> str:
-        return getattr(self.function, "__name__", type(self.function).__name__)
+        return _name_of(self.function)
 
     def __call__(self, rows: np.ndarray) -> np.ndarray:
         return np.array(self.function(rows.copy()))
