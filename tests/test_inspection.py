@@ -52,8 +52,9 @@ def test_a_shell_prints_it_as_json_alone(inside, tmp_path):
     assert shown.returncode == 0, shown.stderr
     assert json.loads(shown.stdout)["expert"] == str(expert)
     assert (tmp_path / "ladder.png").stat().st_size > 1000
-    written = inside(*line, tmp_path / "found.json")
+    written = inside(*line, tmp_path / "found.json", "--picture", tmp_path / "again.png")
     assert "noise floor" in written.stdout
+    assert f"written: {tmp_path / 'again.png'}" in written.stdout
     assert json.loads((tmp_path / "found.json").read_text()) == json.loads(shown.stdout)
     failed = inside("inspect", expert, "CartPole-v1", "--json", "-")
     assert failed.returncode == 1

@@ -9,7 +9,7 @@ from fdtasil.results.figures import draw_calibration
 from fdtasil.run.inspecting import inspect
 from fdtasil.shell.call import EXPERT_FLAGS, MADE_FLAGS, opened_in
 from fdtasil.shell.command import EnvironmentId, ExpertPath, Flags, OptionalPath, as_command
-from fdtasil.shell.saying import JSON_FLAG, json_file, say
+from fdtasil.shell.saying import JSON_FLAG, PRINTED, json_file, say
 
 __all__ = ["command"]
 
@@ -28,9 +28,11 @@ def _inspect(
     file = json_file(json)
     source, place = opened_in(arguments)
     found = inspect(source, place, **arguments)
+    say(found, file)
     if drawn is not None and found.calibration is not None:
         write_bytes(drawn, draw_calibration(found.calibration))
-    say(found, file)
+        if file != PRINTED:
+            print(f"written: {picture}")
     if found.problem:
         raise found.problem
 

@@ -9,9 +9,10 @@ from fdtasil.files.plain import without_infinities
 from fdtasil.files.storage import write_bytes
 from fdtasil.shell.command import OptionalPath
 
-__all__ = ["JSON_FLAG", "json_file", "say"]
+__all__ = ["JSON_FLAG", "PRINTED", "json_file", "say"]
 
-_PRINTED = Path("-")
+PRINTED = Path("-")
+"""In the place of a file: the JSON alone is printed."""
 JSON_FLAG: dict[str, tuple[Any, Any, str]] = {
     "json": (
         OptionalPath,
@@ -36,7 +37,7 @@ def json_file(path: Path | None) -> Path | None:
     Raises:
         SettingError: If its name ends otherwise.
     """
-    if path == _PRINTED:
+    if path == PRINTED:
         return path
     return None if path is None else check_suffix(path, ".json").absolute()
 
@@ -47,7 +48,7 @@ def say(found: Found, file: Path | None) -> None:
         print(found)
         return
     text = json.dumps(without_infinities(found.to_json())[0], indent=2)
-    if file == _PRINTED:
+    if file == PRINTED:
         print(text)
         return
     write_bytes(file, text.encode())  # first: who reads the print may stop to
