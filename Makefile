@@ -4,7 +4,7 @@ BIN = .venv/bin
 # One thread per process: several at once on few cores are many times slower otherwise.
 export OMP_NUM_THREADS = 1
 
-.PHONY: demo docs film test torture lint types wheel dist check clean
+.PHONY: demo docs film test test-slow torture lint types wheel dist check clean
 
 demo: .venv/ready
 	$(BIN)/fdtasil distill experts/HalfCheetah-v5.onnx HalfCheetah-v5 \
@@ -21,7 +21,11 @@ film: .venv/ready
 		--horizon 150 --every 2 --height 240 --out benchmarks/figures/film.webp
 
 test: .venv/ready
-	$(BIN)/python -m pytest -q -n 2 -m "not slow"
+	$(BIN)/python -m pytest -q -n 2 -m "not slow and not torture"
+
+# The others that every change must pass; most of them start processes or train for long.
+test-slow: .venv/ready
+	$(BIN)/python -m pytest -q -n 2 -m "slow and not torture"
 
 # Everything, in about an hour, and a table of what was survived.
 torture: .venv/ready
@@ -49,7 +53,7 @@ wheel dist: .venv/ready
 		(cd .wheel && bin/python -P ../tests/wheel_run.py); \
 	done
 
-check: lint types docs wheel test
+check: lint types docs wheel test test-slow
 
 # torch goes first and pinned: left to itself pip would take a build with gigabytes of CUDA.
 .venv/ready: pyproject.toml constraints.txt

@@ -1,5 +1,6 @@
 """How torch computes on this machine: threads, matrix products and the device."""
 
+import functools
 import re
 import threading
 from collections.abc import Iterator
@@ -125,7 +126,7 @@ def torch_settings(device: torch.device, threads: int = 1) -> Iterator[str]:
             # Of GPUs too, where it rounds, and where the caller may compute beside this run.
             if not torch.cuda.is_available():
                 torch.set_float32_matmul_precision("medium")
-            if _product_error(device) > _ACCEPTED_ERROR:
+            if _product_error(device, torch.get_float32_matmul_precision()) > _ACCEPTED_ERROR:
                 torch.set_float32_matmul_precision(before_precision)
             yield torch.get_float32_matmul_precision()
         except RuntimeError as error:
@@ -148,8 +149,9 @@ def _full(error: RuntimeError) -> FitError:
     )
 
 
-def _product_error(device: torch.device) -> float:
-    """Return the relative error of one float32 product of a training step's size."""
+@functools.cache  # as long as some training steps, and always the same
+def _product_error(device: torch.device, precision: str) -> float:
+    """Return the relative error of one float32 product of a training step's size, as now set."""
     random = torch.Generator().manual_seed(0)
     left, right = torch.randn(128, 512, generator=random), torch.randn(512, 512, generator=random)
     exact = left.double() @ right.double()

@@ -81,9 +81,10 @@ def one_thread():
 
 
 @pytest.fixture(autouse=True, scope="session")
-def versions_are_read_once():
-    """Reading them out of packages is a third of a run of forty steps."""
+def little_is_said_of_a_run():
+    """Versions and the time of an answer: to find them takes as long as a run of forty steps."""
     with pytest.MonkeyPatch.context() as patch:
+        patch.setattr("fdtasil.results.size._CALLS", 2)
         patch.setattr("fdtasil.run.report.version", functools.cache(importlib.metadata.version))
         yield
 

@@ -209,6 +209,7 @@ def test_a_patience_that_is_no_number_is_named(value, monkeypatch):
         patience()
 
 
+@pytest.mark.slow
 @pytest.mark.fault(190)
 @pytest.mark.parametrize("words", [("--help",), ("distill", "--help"), ("nonsense",)])
 def test_who_reads_may_stop_reading(words):
@@ -229,7 +230,7 @@ def test_who_reads_may_stop_reading(words):
 
 
 @pytest.mark.fault(191)
-@pytest.mark.slow
+@pytest.mark.torture
 def test_few_descriptors_end_in_an_error_of_ours(tmp_path):
     """In a process that has loaded everything, and a fork of it for each number of them."""
     code = """

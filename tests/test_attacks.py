@@ -128,6 +128,7 @@ def ways_to_open(path):
     yield lambda: fdtasil.evaluate(path, lambda rows: rows[:, :2], TOY, episodes=1)
 
 
+@pytest.mark.slow
 @pytest.mark.fault(7, 8)
 @pytest.mark.filterwarnings("ignore")
 def test_no_code_of_a_file_runs(tmp_path, monkeypatch, figure):

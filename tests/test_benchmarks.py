@@ -43,6 +43,7 @@ def doubles(path):
     return {row["cell"]["number"]: row["result"]["double"] for row in results_of(read_rows(path))}
 
 
+@pytest.mark.slow
 @pytest.mark.fault(120)
 @pytest.mark.parametrize("workers", [1, 2])
 def test_a_failed_cell_is_kept_and_does_not_stop_the_others(workers, tmp_path):
@@ -98,7 +99,7 @@ def test_cells_side_by_side_have_one_thread_each(tmp_path):
         assert row["result"] == {"torch": 1, "others": 1}
 
 
-@pytest.mark.slow  # a cluster has to be begun
+@pytest.mark.torture  # a cluster has to be begun
 def test_ray_gives_the_same_results(tmp_path):
     """Three cells on a Ray of this machine."""
     ray = pytest.importorskip("ray", reason="needs the extra: pip install 'fdtasil[ray]'")
@@ -163,6 +164,7 @@ def test_a_column_marks_what_many_differences_together_leave():
     assert difference_column([None]) == (["-"], "")
 
 
+@pytest.mark.slow
 def test_the_shell(tmp_path, capsys, monkeypatch):
     """One process of its own, which takes seconds; the rest here."""
     command = [sys.executable, "-m", "benchmarks", "list"]
@@ -214,6 +216,7 @@ def test_the_quality_table_pairs_equal_seeds(tmp_path):
     assert "+0.350" in table
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "name", [name for name in BENCHMARKS if (FIGURES / f"{name}.md").exists()]
 )
@@ -292,6 +295,7 @@ def test_results_of_other_versions_are_not_shared(name, times, tmp_path):
     assert ran == [0] * times
 
 
+@pytest.mark.slow
 def test_distillations_are_sent_to_other_processes(tmp_path):
     from benchmarks.distillation import distillations
 
@@ -384,7 +388,7 @@ def test_a_student_beside_its_expert_under_disturbances():
         BENCHMARK.draw(rows)
 
 
-@pytest.mark.slow
+@pytest.mark.torture
 def test_every_disturbance_runs():
     from benchmarks.disturbances import DISTURBANCES
     from benchmarks.robustness import compare_under_disturbances
@@ -457,6 +461,7 @@ def test_a_board_without_its_tools_says_what_to_install(monkeypatch):
         on_board(BOARDS["Cortex-M4F"], "", "", np.zeros((1, 3), np.float32))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["student.c", "student.int8.c"])
 @pytest.mark.parametrize("board", ["Cortex-M3", "Cortex-M4F", "Cortex-M33"])
 def test_a_simulated_board_answers_as_the_student(board, name):

@@ -52,6 +52,7 @@ def started(monkeypatch):
     return found
 
 
+@pytest.mark.slow
 def test_the_evaluation_is_that_of_the_same_call(run, tmp_path):
     """Whatever the environment prints."""
     loud = "import toy_environments\nprint('much ' * 99)\nimport os\nos.write(1, b'noise')\n"
@@ -67,12 +68,14 @@ def test_nothing_is_begun_where_nothing_is_compared(started):
     assert started == []
 
 
+@pytest.mark.slow
 def test_what_the_distillation_raises_comes_back(run):
     refused = pytest.raises(ExpertError, match=r"none\.onnx can't be read")
     with evaluated_beside({**run, "expert": "none.onnx"}) as cloning, refused:
         cloning()
 
 
+@pytest.mark.slow
 def test_a_process_that_ends_by_itself_is_named(run, tmp_path):
     (tmp_path / "gone.py").write_text("import os, sys\nsys.stderr.write('bye')\nos._exit(3)\n")
     refused = pytest.raises(FitError, match=r"ended with code 3: .*bye")
@@ -88,7 +91,7 @@ def test_it_ends_with_the_block(run, started):
     assert process.returncode == -signal.SIGKILL
 
 
-@pytest.mark.slow
+@pytest.mark.torture
 def test_it_ends_with_a_parent_that_is_killed(run, tmp_path):
     script = f"""
 import fdtasil.run.elsewhere as elsewhere

@@ -41,6 +41,7 @@ def small(kind: str) -> BlackBox:
     return replace(box, make=TINY.get(kind, box.make))
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:2 coordinates stand still")  # of Reacher: the goal
 @pytest.mark.fault(29, 44)
 @pytest.mark.parametrize("kind", BLACK_BOXES)

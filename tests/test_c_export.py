@@ -76,6 +76,7 @@ def test_a_sanitiser_finds_nothing_and_no_memory_is_asked_for(tmp_path):
 SANITISERS = ("-fsanitize=address,undefined", "-fno-sanitize-recover")
 
 
+@pytest.mark.slow
 @needs_a_compiler
 @pytest.mark.parametrize("activation", ACTIVATIONS)
 @pytest.mark.parametrize("hidden", [(), (64, 64), (24, 7, 5)], ids=str)
@@ -145,6 +146,7 @@ def test_a_student_that_eight_bits_change_is_refused():
         export(student, FAR, {}, "student.int8.c")
 
 
+@pytest.mark.slow
 @needs_a_compiler
 @pytest.mark.fault(223)
 @pytest.mark.parametrize("name", ["student.c", "student.int8.c"])

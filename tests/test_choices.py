@@ -90,6 +90,7 @@ def test_every_source_teaches_choices(expert, probes, trainer, tmp_path):
     assert "agreement" in str(result.evaluation)
 
 
+@pytest.mark.slow
 def test_scores_are_learnt_and_the_best_is_taken(tmp_path):
     result = distilled(scores, fit=fdtasil.Fit(steps=1500), episodes=5)
     assert result.evaluation.agreement > 0.9

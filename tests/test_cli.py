@@ -280,6 +280,7 @@ def test_an_error_is_short_and_says_the_next_step(
         assert "next step" in failed.stderr
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("arguments", "code"), [(["distill", "none.onnx", TOY], 1), (["dist"], 2)]
 )
@@ -352,7 +353,7 @@ def test_a_run_goes_on_where_it_was_begun_or_where_it_is_told_to(inside, tmp_pat
 # --- surroundings
 
 
-@pytest.mark.slow
+@pytest.mark.torture
 def test_a_module_of_the_current_folder_and_a_warning_without_source(expert, tmp_path):
     """As the installed command, which does not look into the current folder by itself."""
     (tmp_path / "theirs.py").write_text("from toy_environments import Integrator\n")
@@ -400,6 +401,7 @@ def test_the_version_is_told():
     assert shell("--version").stdout == f"fdtasil {fdtasil.__version__}\n"
 
 
+@pytest.mark.slow
 def test_no_other_file_of_the_current_folder_is_run(expert, tmp_path):
     """Optional modules that dependencies look for may lie in a folder that was downloaded."""
     for name in ("glfw_preview", "cffi", "tensorboard"):
@@ -427,6 +429,7 @@ def test_a_word_that_is_no_number_takes_three_lines(words, said, inside):
     assert len(done.stderr.splitlines()) == 3
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no such terminals")
 def test_in_a_terminal_too_with_its_colours():
     import pty

@@ -83,8 +83,9 @@ def wait_for(condition):
         time.sleep(0.005)
 
 
+@pytest.mark.slow
 @pytest.mark.fault(108, 115)
-@pytest.mark.parametrize("kills", [4, pytest.param(200, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kills", [4, pytest.param(200, marks=pytest.mark.torture)])
 def test_kills_at_random_moments(kills, nursery, expert, golden, tmp_path, figure):
     """Kill a run again and again until it is through; then the next one.
 
@@ -115,6 +116,7 @@ def test_kills_at_random_moments(kills, nursery, expert, golden, tmp_path, figur
     figure("kills at random moments", f"{killed} kills, {finished} runs ended with golden bytes")
 
 
+@pytest.mark.slow
 @pytest.mark.fault(80, 121)
 @pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143)])
 def test_a_signal_waits_for_a_checkpoint(number, code, nursery, expert, golden, tmp_path):
@@ -133,6 +135,7 @@ def test_a_signal_waits_for_a_checkpoint(number, code, nursery, expert, golden, 
     assert read(folder) == golden[0]
 
 
+@pytest.mark.slow
 @pytest.mark.fault(112)
 @pytest.mark.parametrize("way", ["out", "resume"])
 def test_a_folder_belongs_to_one_process(way, nursery, expert, golden, tmp_path):
@@ -201,7 +204,7 @@ def states(expert, tmp_path_factory):
 
 @pytest.mark.fault(109)
 @pytest.mark.filterwarnings("ignore:.* and another one that has not ended")
-@pytest.mark.parametrize("every", [41, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("every", [41, pytest.param(1, marks=pytest.mark.torture)])
 @pytest.mark.parametrize("forever", [False, True])
 def test_any_write_may_fail(every, forever, expert, states, tmp_path, monkeypatch, figure):
     """The n-th write fails for every n: the old run or the new one, never anything between."""
@@ -296,7 +299,7 @@ def mutate(data, random):
 
 
 @pytest.mark.fault(116)
-@pytest.mark.parametrize("count", [100, pytest.param(2000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [100, pytest.param(2000, marks=pytest.mark.torture)])
 def test_every_mutated_file_of_ours_is_detected(count, expert, tmp_path, figure):
     fdtasil.distill(expert, TOY, out=tmp_path, **SHORT)
     files = [path for path in sorted(tmp_path.rglob("*")) if path.is_file()]

@@ -120,6 +120,7 @@ def seen(observations):
 MASK = np.array([True, True, True, True, False])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("student_obs", [range(4), seen, (3, 1, 0, 2), MASK])
 @pytest.mark.parametrize("trainer", ["bc", "dagger", "dart"])
 def test_the_student_sees_less(student_obs, trainer, linear):

@@ -129,6 +129,7 @@ def test_an_episode_that_ends_does_not_look_like_recovery():
     assert measured(1.0, SIZES, 40, Ending).rate == pytest.approx(1, abs=1e-4)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("nu", "order"), [(0.8, 1), (0.4, 2)])
 def test_one_that_forgives_less_asks_for_a_higher_order(nu, order):
     """Two paths rest (e / 0.2) ** nu apart, and pass at 2 ** (1 - nu) times that at most.
@@ -314,6 +315,7 @@ def never(rows):
     raise AssertionError("asked")
 
 
+@pytest.mark.slow
 def test_better_students_have_better_derivatives(tmp_path):
     expert = linear(GAIN)
     returns, errors = [], []
@@ -330,6 +332,7 @@ def test_better_students_have_better_derivatives(tmp_path):
     assert spearmanr(returns, errors).statistic == pytest.approx(1.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "student_obs",
     [None, [3, 2, 1, 0], lambda rows: rows[:, ::-1]],

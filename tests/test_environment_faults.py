@@ -535,6 +535,7 @@ def goes_on(folder):
     assert not list(folder.rglob("*.tmp"))
 
 
+@pytest.mark.slow
 @pytest.mark.fault(72)
 @pytest.mark.parametrize(("how", "code"), [("exit", 3), ("segfault", -signal.SIGSEGV)])
 def test_a_process_that_an_environment_ends_leaves_whole_checkpoints(how, code, nursery, tmp_path):
@@ -555,6 +556,7 @@ def test_an_environment_that_hangs_is_ended_by_ctrl_c_and_the_run_goes_on(nurser
     goes_on(tmp_path)
 
 
+@pytest.mark.slow
 @pytest.mark.fault(80)
 def test_ctrl_c_in_a_rollout_is_one_line_and_130(tmp_path):
     """From the command line, in the expert's first rollouts."""

@@ -17,6 +17,7 @@ EXAMPLES = Path(__file__).parent.parent / "examples"
 SCRIPTS = sorted(path.stem for path in EXAMPLES.glob("*.py") if path.stem[:11] != "constrained")
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("no_pictures")
 @pytest.mark.filterwarnings("ignore::fdtasil.FdtasilWarning")
 @pytest.mark.parametrize("script", SCRIPTS)
@@ -50,7 +51,7 @@ def cart_pole(monkeypatch):
 
 @pytest.mark.usefixtures("no_pictures")
 @pytest.mark.filterwarnings("ignore::fdtasil.FdtasilWarning")
-@pytest.mark.slow
+@pytest.mark.torture
 def test_a_planner_with_hard_limits(cart_pole):
     rest, lost = np.zeros(4), np.array([0.99, 0.0, 2.0, 0.0])  # too fast for what is left of it
     answers = cart_pole.controller(np.stack([rest, lost]))

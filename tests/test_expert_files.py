@@ -470,7 +470,7 @@ def bomb(path, model):
         sum_of_many(2 * 10**9),
         sum_of_many(10**12),
         sum_of_many(10**18),
-        pytest.param(doubled(60, "one"), marks=pytest.mark.slow),
+        pytest.param(doubled(60, "one"), marks=pytest.mark.torture),
     ],
 )
 def test_a_small_file_that_unpacks_to_gigabytes(model, tmp_path):
@@ -574,8 +574,9 @@ def summary(outcomes):
     return f"0 crashes, 0 hangs, 0 other exceptions; {', '.join(counts)}"
 
 
+@pytest.mark.slow
 @pytest.mark.fault(10)
-@pytest.mark.parametrize("count", [200, pytest.param(12_000, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [200, pytest.param(12_000, marks=pytest.mark.torture)])
 def test_mutated_models(count, models, figure):
     outcomes = open_mutated(models, count)
     found = summary(outcomes)
@@ -585,7 +586,8 @@ def test_mutated_models(count, models, figure):
     assert outcomes.total() == count
 
 
-@pytest.mark.parametrize("count", [100, pytest.param(2_000, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("count", [100, pytest.param(2_000, marks=pytest.mark.torture)])
 def test_mutated_agents(count, agents, figure):
     outcomes = open_mutated(agents, count)
     found = summary(outcomes)

@@ -224,6 +224,7 @@ def test_normalisation_over_the_batch(tmp_path):
     assert "asked alone and in a batch differs by up to" in text
 
 
+@pytest.mark.slow
 @pytest.mark.fault(42)
 def test_a_recurrent_network_has_a_memory(tmp_path):
     with torch.random.fork_rng():
@@ -276,6 +277,7 @@ def test_the_algorithm_is_read_from_the_zip(tmp_path):
 # --- what a function answers
 
 
+@pytest.mark.slow
 @pytest.mark.fault(45)
 def test_an_expert_that_takes_hours_is_announced_before_it_acts():
     asked = []
@@ -322,6 +324,7 @@ PLAIN = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.fault(53, 54, 59)
 @pytest.mark.parametrize("workers", [0, 1])
 @pytest.mark.parametrize("kind", PLAIN)

@@ -333,6 +333,7 @@ with torch_settings(torch.device("cpu")):
 """
 
 
+@pytest.mark.slow
 @pytest.mark.skipif(platform.libc_ver()[0] != "glibc", reason="another allocator than glibc's")
 def test_a_step_takes_the_memory_that_the_last_one_freed():
     """A system that gives new pages each time takes a third of a step with fifty probes."""

@@ -221,6 +221,7 @@ COMMANDED = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.fault(297)
 @pytest.mark.parametrize("probes", [0, 3, "fresh:3"])
 @pytest.mark.parametrize("spread", [{4: 0.58}, "bounds"])
@@ -255,6 +256,7 @@ def test_a_dataset_keeps_the_deviations_that_were_said(spread, probes, tmp_path)
             fdtasil.distill(follows, Commanded, **again, spread={4: 0.1}, **run)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("spread", [{4: 0.58}, "4:0.58", "bounds"])
 def test_one_demonstration_teaches_every_command(spread):
     result = fdtasil.distill(follows, Commanded, "fresh", spread=spread, **COMMANDED)

@@ -145,7 +145,7 @@ class Differences:
         return np.clip(-2 * observation - 2 * speed, -3, 3), (observation, np.ones_like(known))
 
 
-@pytest.mark.slow
+@pytest.mark.torture
 def test_a_hidden_speed_is_learnt_from_the_past():
     run = {"episodes": 3, "horizon": 60, "fit": fdtasil.Fit(steps=2000), "progress": False}
     run |= {"student": fdtasil.Mlp(64), "evaluation_episodes": 10}
@@ -207,6 +207,7 @@ def test_what_was_recorded_with_a_memory_is_learnt_again_without_asking(history,
 AGAIN = {"progress": False, "fit": QUICK["fit"], "student": QUICK["student"]}
 
 
+@pytest.mark.slow
 @pytest.mark.fault(291)
 @pytest.mark.parametrize("before", [1, 2, 5])
 @pytest.mark.parametrize("expert", [linear_here, Remembers()], ids=["plain", "remembers"])

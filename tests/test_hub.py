@@ -421,7 +421,7 @@ def test_inspect_and_evaluate(hub, inside):
     assert "normalised return" in judged.stdout
 
 
-@pytest.mark.slow
+@pytest.mark.torture
 def test_a_shell_without_a_network_says_so_in_time(hub, tmp_path):
     hub.silent = ""
     failed = shell("distill", WALKER, TOY, "--out", tmp_path / "run")

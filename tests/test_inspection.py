@@ -45,6 +45,7 @@ def test_what_is_no_expert_is_shown_with_its_problem(expert, named):
     assert str(found.problem) in [one["problem"] for one in found.to_json()["findings"]]
 
 
+@pytest.mark.slow
 def test_a_shell_prints_it_as_json_alone(inside, tmp_path):
     expert = mlp_onnx(tmp_path / "e.onnx")
     line = ("inspect", expert, TOY, "--episodes", 2, "--json")

@@ -7,6 +7,8 @@ import subprocess
 import sys
 from pathlib import Path
 
+import pytest
+
 import fdtasil
 
 # The house, floor by floor from its roof: a room may import what stands below it, and itself.
@@ -77,6 +79,7 @@ def test_few_files_import_stable_baselines3():
     assert found == {"events.py", "into_sb3.py", "trusted.py"}
 
 
+@pytest.mark.slow
 def test_the_face_is_light():
     heavy = ["stable_baselines3", "matplotlib", "onnx", "onnxruntime", "scipy.stats"]
     heavy += ["huggingface_hub"]
@@ -96,6 +99,7 @@ def _loaded(code: str, modules: list[str]) -> list[str]:
     return [name for name in shown.stdout.splitlines()[-1].split(",") if name]
 
 
+@pytest.mark.slow
 def test_it_runs_from_a_plain_checkout(tmp_path):
     """Without being installed, and without metadata that say which version it is."""
     shutil.copytree(HOUSE, tmp_path / "fdtasil", ignore=shutil.ignore_patterns("__pycache__"))

@@ -186,6 +186,7 @@ class Stop(Exception):
     """Stands for a kill."""
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("many_checkpoints")
 def test_it_resumes_to_the_byte(expert, tmp_path):
     run = {**QUICK, "trainer": "dagger", "episodes": 3, "fit": fdtasil.Fit(steps=105)}

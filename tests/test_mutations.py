@@ -235,7 +235,7 @@ class Checkpoints(Reader):
     def __init__(self, folder):
         super().__init__(folder)
         self.stages = sorted((self.folder / "begun/checkpoints").glob("*/*/"))
-        assert {path.name.partition("-")[0] for path in self.stages} >= {"collected", "training"}
+        assert {path.name.partition("-")[0] for path in self.stages} >= {"added", "training"}
 
     def read(self, random):
         import torch
@@ -405,6 +405,7 @@ def _child(kind, folder, first, last):
     return lines, ending
 
 
+@pytest.mark.slow
 @pytest.mark.fault(139)
 @pytest.mark.filterwarnings("ignore")
 @pytest.mark.parametrize("kind", KINDS)
@@ -421,7 +422,7 @@ def test_some_mutated_files_end_in_an_error_of_ours(kind, originals, monkeypatch
 
 
 @pytest.mark.fault(139)
-@pytest.mark.slow
+@pytest.mark.torture
 @pytest.mark.parametrize("kind", KINDS)
 def test_mutated_files_end_in_an_error_of_ours(kind, originals, figure):
     count = COUNT

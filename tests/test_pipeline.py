@@ -247,7 +247,7 @@ def test_the_interval_holds_the_score_and_the_gap_is_in_deviations(linear):
     assert 0.1 < worse.imitation_gap < 10
 
 
-@pytest.mark.slow
+@pytest.mark.torture
 @pytest.mark.parametrize(("name", "bar", "apart"), [("Walker2d", 0.90, 0.0), ("HalfCheetah", 0.93, 0.3)])  # fmt: skip  # noqa: E501
 def test_the_papers_experts_are_copied_from_five_episodes(name, bar, apart, shared):
     """Three seeds each, default settings: the figures of the first issue."""

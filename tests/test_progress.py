@@ -34,7 +34,8 @@ def test_a_notebook_counts_as_a_terminal(shell, progress, shown, monkeypatch, ca
     assert ("step/s" in capsys.readouterr().err) is shown
 
 
-@pytest.mark.parametrize("progress", [True, pytest.param(False, marks=pytest.mark.slow)])
+@pytest.mark.slow
+@pytest.mark.parametrize("progress", [True, pytest.param(False, marks=pytest.mark.torture)])
 def test_in_a_real_kernel(progress, monkeypatch):
     nbformat = pytest.importorskip("nbformat", reason="needs the extra docs")
     nbclient = pytest.importorskip("nbclient", reason="needs the extra docs")

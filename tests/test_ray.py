@@ -39,7 +39,7 @@ def cluster():
 
 
 @pytest.mark.fault(212)
-@pytest.mark.slow
+@pytest.mark.torture
 @pytest.mark.usefixtures("cluster")
 def test_the_bytes_are_those_of_one_process_though_a_worker_is_killed(tmp_path):
     marker = str(tmp_path / "killed")
@@ -58,7 +58,7 @@ def test_the_bytes_are_those_of_one_process_though_a_worker_is_killed(tmp_path):
     assert expert.queries["probe"] == 60
 
 
-@pytest.mark.slow
+@pytest.mark.torture
 @pytest.mark.usefixtures("cluster")
 def test_what_an_expert_raises_there_is_told_here():
     def limited(rows):

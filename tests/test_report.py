@@ -213,6 +213,7 @@ def test_the_call_of_the_card_says_what_an_expert_was_opened_with(tmp_path):
     assert re.search(r"expert = \.\.\.  # .*e\.onnx, opened with output='actions'", card)
 
 
+@pytest.mark.slow
 @pytest.mark.fault(266)
 def test_the_call_of_the_card_leaves_a_length_that_grew_to_grow_again(linear):
     run = {"episodes": 50, "horizon": 40, "evaluation_episodes": 0, "student": fdtasil.Mlp(4)}

@@ -100,6 +100,17 @@ def test_validation_and_best_weights_are_resumed(expert, tmp_path):
     assert read(tmp_path / "run") == read(tmp_path / "golden")
 
 
+def test_a_round_keeps_what_it_adds_and_not_what_was_there_before(expert, tmp_path):
+    """The checkpoints of many rounds grew with their square."""
+    run = RUN | {"trainer": fdtasil.DAgger(updates=(2, 4, 6, 8)), "episodes": 10}
+    # Every round has an entry at 100 steps, one at its end, and the event of the round.
+    with pytest.raises(Stop):
+        fdtasil.distill(expert, TOY, out=tmp_path / "run", callback=stop_at(15), **run)
+    kept = sorted((tmp_path / "run/checkpoints").glob("*/added-0/demonstrations.npz"))
+    rows = [len(np.load(path)["values"]) for path in kept]
+    assert rows == [2 * QUICK["horizon"]] * 5
+
+
 @pytest.mark.fault(113)
 def test_another_configuration_is_refused_with_the_difference(expert, tmp_path):
     with pytest.raises(Stop):
@@ -135,6 +146,7 @@ def test_a_broken_checkpoint_is_named_and_an_earlier_one_used(expert, golden, tm
     assert read(folder) == expected
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("probes", ["sphere:2,forward", "sphere:12,forward,resample", "fresh:12"])
 def test_a_run_that_asked_all_it_may_is_resumed(probes, expert, tmp_path):
     """What was asked again is no part of the budget, and the budget may be another."""
@@ -167,6 +179,7 @@ def test_a_resumed_run_stays_in_its_own_folder(expert, tmp_path):
         fdtasil.distill(expert, TOY, out=tmp_path / "a", resume=tmp_path / "b", **RUN)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kept", [0, 1, 3])
 def test_stopped_while_the_probes_are_asked_nothing_is_lost(kept, tmp_path, monkeypatch):
     """Demonstrations are kept before the probes, and the answers on the way, block by block."""
@@ -221,6 +234,7 @@ class WithDerivatives:
         return np.broadcast_to(GAIN, (len(observations), *GAIN.shape))
 
 
+@pytest.mark.slow
 @pytest.mark.fault(236)
 @pytest.mark.parametrize("count", [3, 5])
 def test_own_derivatives_are_compared_once_over_interruptions(count, tmp_path):

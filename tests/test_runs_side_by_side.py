@@ -51,7 +51,7 @@ def files_of(folder):
 
 
 @pytest.mark.fault(195)
-@pytest.mark.parametrize("count", [2, pytest.param(8, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [2, pytest.param(8, marks=pytest.mark.torture)])
 def test_runs_in_threads_have_the_bytes_that_they_have_alone(count, expert, tmp_path):
     alone = {}
     for seed in range(count):
@@ -117,6 +117,7 @@ MODES = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.fault(198)
 @pytest.mark.parametrize("probes", ["sphere:2", "jacobian"])
 @pytest.mark.parametrize("mode", MODES)

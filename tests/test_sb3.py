@@ -241,6 +241,7 @@ def test_export_from_a_shell(save, monkeypatch, capsys, tmp_path):
     assert fdtasil.load_expert(out).action_size == 1
 
 
+@pytest.mark.slow
 def test_the_parity_table(monkeypatch, capsys):
     """A short version of what experts/parity.py shows of every algorithm."""
     script = str(Path(__file__).parents[1] / "experts" / "parity.py")

@@ -116,6 +116,7 @@ def test_another_algorithm_with_the_settings_of_sac(save):
 ODD = [None, True, -1, 1e300, "x", "\x1b[2J\n\n" + "x" * 10**6, [], [[]], {}, {"a": [None]}]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("odd", ODD, ids=lambda odd: repr(odd)[:12])
 def test_odd_records_raise_nothing_else(odd, plain):
     """Also where bounds are given, which are as long as the file says."""

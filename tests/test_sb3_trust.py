@@ -92,6 +92,7 @@ def test_no_code_of_statistics_runs(plain, tmp_path):
     assert marker.exists()
 
 
+@pytest.mark.slow
 def test_the_library_is_not_imported(plain):
     code = (
         "import sys; from fdtasil.experts.sb3.agent import read_agent; read_agent(sys.argv[1]);"
@@ -129,6 +130,7 @@ def test_squashing_ppo_needs_trust(save):
     assert np.abs(answers(read, 100 * states_for(agent))).max() > 1.9  # of 2: rescaled
 
 
+@pytest.mark.slow
 def test_gsde_is_exported_with_trust(save, tmp_path):
     agent = make_agent("SAC", use_sde=True)
     out = export_sb3(save(agent), tmp_path / "out.onnx", trust="pickle")
@@ -162,6 +164,7 @@ class Halved(ActorCriticPolicy):
         return actions / 2, state
 
 
+@pytest.mark.slow
 @pytest.mark.fault(50)
 @pytest.mark.parametrize(
     ("policy", "kwargs"),

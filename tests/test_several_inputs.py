@@ -116,6 +116,7 @@ def test_groups_are_taken_from_columns(grouped):
     assert np.array_equal(again.ask(ROWS, "act"), expert.ask(ROWS, "act"))
 
 
+@pytest.mark.slow
 def test_it_is_distilled_with_one_flag(noisy, tmp_path):
     expert = opened(str(noisy), TOY, output=None, inputs="noise=0", trust=None)
     result = fdtasil.distill(expert, TOY, 3, **QUICK, progress=False, out=tmp_path / "run")

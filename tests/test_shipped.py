@@ -97,6 +97,7 @@ def test_a_source_tree_has_all_of_them(inside):
         assert list(map(float, row[2:])) == pytest.approx(stated, abs=0.051)
 
 
+@pytest.mark.slow
 def test_a_wheel_has_one_and_says_where_the_others_are(installed, tmp_path):
     rows = installed(cwd=tmp_path).stdout.splitlines()[1:]
     assert [row.split()[0] for row in rows if row.split()[2] == "yes"] == [SMALL]
@@ -111,6 +112,7 @@ def test_a_wheel_has_one_and_says_where_the_others_are(installed, tmp_path):
     assert is_whole(tmp_path / f"{OTHER}.onnx", OTHER)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("end", ["", "/"])
 def test_others_come_from_an_address(installed, served, tmp_path, end):
     address = served(partial(Quiet, directory=EXPERTS)) + end

@@ -32,6 +32,7 @@ def run():
     )
 
 
+@pytest.mark.slow
 def test_the_smallest_that_keeps_the_level(run, tmp_path):
     asked = []
 
@@ -81,7 +82,7 @@ def test_none_that_keeps_it(run):
     assert "no student" in str(found)
 
 
-@pytest.mark.slow
+@pytest.mark.torture
 def test_side_by_side_they_are_the_same(tmp_path):
     expert = str(mlp_onnx(tmp_path / "e.onnx"))
     run = fdtasil.distill(expert, TOY, 3, **QUICK)
@@ -137,6 +138,7 @@ def test_another_call_in_the_same_folder_is_refused(run, tmp_path):
         )
 
 
+@pytest.mark.slow
 @pytest.mark.fault(257)
 @pytest.mark.fault(352)
 def test_a_killed_one_goes_on(run, tmp_path, monkeypatch):
@@ -171,7 +173,7 @@ def test_cloned_ones_train_as_long_as_those_that_ask_anew(tmp_path):
     assert students[1].settings["probes"] == "none"
 
 
-@pytest.mark.slow
+@pytest.mark.torture
 def test_a_script_without_a_guard_runs_once(tmp_path):
     expert = mlp_onnx(tmp_path / "e.onnx")
     fdtasil.distill(str(expert), TOY, 2, **QUICK).save(tmp_path / "run")
@@ -192,7 +194,7 @@ print(len(found.candidates))
     assert done.stdout.split() == ["begun", "2"], done.stderr
 
 
-@pytest.mark.slow
+@pytest.mark.torture
 def test_a_failure_side_by_side_ends_the_others():
     begun = time.monotonic()
     with pytest.raises(SettingError, match="the first"):

@@ -117,6 +117,7 @@ SETTINGS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.fault(206)
 @pytest.mark.parametrize("setting", SETTINGS.values(), ids=SETTINGS)
 @pytest.mark.parametrize("planner", PLANNERS.values(), ids=PLANNERS)
@@ -233,6 +234,7 @@ class Stop(Exception):
     """Stands for a kill."""
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("many_checkpoints")
 @pytest.mark.parametrize("count", [1, 3, 5])
 def test_it_resumes_to_the_byte_and_counts_each_silence_once(count, tmp_path):
@@ -258,6 +260,7 @@ def test_it_resumes_to_the_byte_and_counts_each_silence_once(count, tmp_path):
     assert resumed.report["rows_asked_again_after_resuming"] > 0
 
 
+@pytest.mark.slow
 def test_workers_and_servers_have_no_answer_too():
     expert = load_expert(raising_planner, 5, 2, workers=2, batch=8)
     answers = expert.ask(ROWS, "probe")

@@ -56,6 +56,7 @@ def test_a_flat_form_leads_back(form):
     assert Layout.from_json(layout.to_json()) == layout
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("form", OBSERVATIONS)
 def test_the_same_numbers_in_another_form_teach_the_same(form, plain, tmp_path):
     """Rollout, probes, training, evaluation, the student's own form, file and ONNX."""

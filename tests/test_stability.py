@@ -87,6 +87,7 @@ def test_a_constant_error_ends_where_gamma_says():
     assert max(perfect["gap"]["q90"]) < 1e-12
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("nu", [0.5, 1.0, 2.0])
 def test_what_a_diagnosis_measures_of_it_is_the_formula(nu):
     """A lasting error e leads 5 e^nu (1 - 0.95^T) away, in whichever direction."""
@@ -104,6 +105,7 @@ def test_what_a_diagnosis_measures_of_it_is_the_formula(nu):
     assert str(law).endswith({0.5: "for: 1 to 2", 1.0: "for: 1", 2.0: "for: 0"}[nu])
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("order", "source"), [(0, "none"), (1, "differences"), (2, "differences"), (2, "jacobian")]
 )

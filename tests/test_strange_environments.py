@@ -443,7 +443,7 @@ def test_a_step_that_returns_what_only_looks_like_a_number_is_refused(change, fo
 def test_a_folder_that_somebody_copied_is_no_checkpoint(linear, tmp_path):
     begun(linear, TOY, tmp_path)
     stage = next(tmp_path.glob("checkpoints/0/*-*"))
-    for name in ("training-100 2", "training-", "training-²", "collected-1 copy"):
+    for name in ("training-100 2", "training-", "training-²", "added-1 copy"):
         stage.with_name(name).mkdir()
     assert _numbered(tmp_path, 0, "training") == []
     assert fdtasil.distill(linear, TOY, 2, resume=tmp_path, **QUICK).evaluation

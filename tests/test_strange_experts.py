@@ -286,6 +286,7 @@ def test_a_gsde_agent_works_after_the_advice_of_its_error(tmp_path):
 # --- what leaves, and what reaches a terminal
 
 
+@pytest.mark.slow
 @pytest.mark.fault(156)
 def test_an_empty_home_stays_empty(tmp_path):
     path, home = mlp_onnx(tmp_path / "e.onnx"), tmp_path / "home"
@@ -461,6 +462,7 @@ DRIPS = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.fault(160)
 @pytest.mark.parametrize("drip", DRIPS)
 def test_the_timeout_is_for_the_whole_exchange(drip, rows):

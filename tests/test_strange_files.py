@@ -611,9 +611,10 @@ def child(script, *arguments):
     return subprocess.Popen([sys.executable, "-c", script, *map(str, arguments)], **pipes)
 
 
+@pytest.mark.slow
 @pytest.mark.fault(132)
 @pytest.mark.parametrize(
-    ("pairs", "reads"), [(3, 20), pytest.param(300, 1000, marks=pytest.mark.slow)]
+    ("pairs", "reads"), [(3, 20), pytest.param(300, 1000, marks=pytest.mark.torture)]
 )
 def test_simultaneous_saves_and_reads(pairs, reads, quick, linear, tmp_path, figure):
     other = fdtasil.distill(linear, TOY, 3, seed=1, **QUICK)
@@ -751,7 +752,7 @@ def _in_a_pool(seed):
 
 
 @pytest.mark.fault(134)
-@pytest.mark.slow
+@pytest.mark.torture
 def test_a_run_in_a_process_pool_is_not_lost():
     with ProcessPoolExecutor(1, get_context("spawn")) as pool:
         found = pool.submit(_in_a_pool, 3).result(120)
@@ -987,7 +988,7 @@ print(fdtasil.Distilled.load("again").queries == result.queries, os.listdir("run
 
 
 @pytest.mark.fault(138)
-@pytest.mark.slow
+@pytest.mark.torture
 @pytest.mark.filterwarnings("ignore")
 def test_it_runs_without_what_only_unix_has(tmp_path):
     shown = subprocess.run(

@@ -131,6 +131,7 @@ def test_an_answer_that_is_not_finite_is_not_exported(rows):
         export_module(Logarithm(), rows, {})
 
 
+@pytest.mark.slow
 @pytest.mark.fault(102)
 def test_an_export_is_of_the_module_in_evaluation_mode_which_is_put_back(rows):
     with torch.random.fork_rng():

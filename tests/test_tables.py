@@ -75,6 +75,7 @@ def test_a_target_that_nobody_writes_is_refused(quick, tmp_path):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.slow
 def test_every_figure_is_a_picture_in_the_folder(quick, tmp_path):
     folder = quick.save(tmp_path / "run") / "figures"
     assert {path.stem for path in folder.iterdir()} == set(FIGURES)

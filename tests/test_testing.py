@@ -96,6 +96,7 @@ def test_a_row_without_an_answer_hides_no_fault_of_the_others(linear):
     assert farthest_apart(none[:1], some[:1]) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.fault(354)
 @pytest.mark.parametrize(
     "sees",

@@ -200,6 +200,7 @@ def test_a_full_gpu_leaves_a_run_that_goes_on_elsewhere(
     assert resumed.student.to_bytes() == whole.student.to_bytes()
 
 
+@pytest.mark.slow
 @pytest.mark.fault(100)
 @pytest.mark.parametrize(
     ("moment", "newest"),

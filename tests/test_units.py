@@ -38,6 +38,7 @@ def trained(unit, bounded):
     return student, states, history
 
 
+@pytest.mark.slow
 @pytest.mark.fault(200)
 @pytest.mark.parametrize("bounded", [True, False])
 @pytest.mark.parametrize("unit", [1e-9, 1e-4, 1e6])
@@ -141,6 +142,7 @@ class InUnits(gymnasium.ObservationWrapper):
         return (observation * self.units).astype(np.float32)
 
 
+@pytest.mark.slow
 @pytest.mark.fault(230)
 @pytest.mark.parametrize("probes", [0, 5])
 def test_a_coordinate_in_small_units_is_seen_and_probed(probes):

@@ -54,6 +54,7 @@ def law(rows):
     return np.clip(np.asarray(rows, np.float32) @ GAIN.T, -1, 1)
 
 
+@pytest.mark.slow
 @pytest.mark.fault(216)
 @pytest.mark.parametrize("kind", KINDS)
 def test_episodes_are_those_of_single_environments(kind):
@@ -73,7 +74,10 @@ def test_episodes_are_those_of_single_environments(kind):
 
 @pytest.mark.parametrize(
     "kind",
-    [pytest.param(kind, marks=[pytest.mark.slow] * kind.startswith("Subproc")) for kind in KINDS],
+    [
+        pytest.param(kind, marks=[pytest.mark.torture] * kind.startswith("Subproc"))
+        for kind in KINDS
+    ],
 )
 def test_a_whole_run(kind, tmp_path):
     """Rollout, probes, training, evaluation, ONNX, resume."""

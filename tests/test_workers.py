@@ -99,6 +99,7 @@ class Predicts:
         return observation @ GAIN.T, None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["predict", "module", "onnx"])
 def test_other_kinds_go_to_processes_too(kind, tmp_path, rows):
     with torch.random.fork_rng():
@@ -289,6 +290,7 @@ def test_a_module_that_is_only_here_is_named(rows, monkeypatch):
     )
 
 
+@pytest.mark.slow
 @pytest.mark.fault(9)
 def test_a_file_that_changes_is_refused(tmp_path, rows):
     expert = fdtasil.load_expert(mlp_onnx(tmp_path / "e.onnx"), 5, 2, workers=1)
@@ -377,8 +379,9 @@ def script(tmp_path):
         process.communicate()
 
 
+@pytest.mark.slow
 @pytest.mark.fault(79)
-@pytest.mark.parametrize("kills", [1, pytest.param(100, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("kills", [1, pytest.param(100, marks=pytest.mark.torture)])
 def test_a_killed_parent_leaves_no_worker(kills, script, figure):
     stuck = "ctypes.PyDLL(None).sleep(100)"  # in C, without letting another thread run
     busy = "time.sleep(100)"
@@ -393,6 +396,7 @@ def test_a_killed_parent_leaves_no_worker(kills, script, figure):
     figure(f"{kills} kills of a parent with two workers", "0 processes left")
 
 
+@pytest.mark.slow
 @pytest.mark.fault(79)
 def test_an_end_leaves_no_worker(script):
     process, pids = script()
@@ -402,6 +406,7 @@ def test_an_end_leaves_no_worker(script):
     assert gone(pids)
 
 
+@pytest.mark.slow
 @pytest.mark.fault(80)
 def test_ctrl_c_shows_one_traceback_and_leaves_no_worker(script):
     process, pids = script("time.sleep(100)")

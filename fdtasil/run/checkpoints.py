@@ -3,7 +3,7 @@
 import io
 from collections import Counter
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Generic, TypeVar
 
 import numpy as np
@@ -22,8 +22,8 @@ from fdtasil.student.fit_state import check_history
 from fdtasil.student.policy import Student
 
 __all__ = [
+    "ADDED",
     "ASKED",
-    "COLLECTED",
     "RECORDED",
     "TRAINED",
     "TRAINING",
@@ -66,6 +66,15 @@ class Collected:
     dataset: Dataset
     episodes: int
     counts: Mapping[str, int]
+
+    def __add__(self, later: "Collected") -> "Collected":
+        """Join what a later round adds, which counts what happened in all."""
+        old, new = self.dataset, later.dataset
+        answers = new.answers
+        if old.answers is not None and answers is not None:
+            answers = old.answers + answers
+        states = old.demonstrations + new.demonstrations
+        return replace(later, dataset=replace(new, demonstrations=states, answers=answers))
 
 
 @dataclass(frozen=True)
@@ -176,8 +185,8 @@ RECORDED = Stage("recorded", _write_collected, _read_collected)
 """A round's own episodes, labelled, before the probes around them are asked."""
 ASKED = Stage("asked", _write_values, _read_values)
 """Answers to the first of a round's probes."""
-COLLECTED = Stage("collected", _write_collected, _read_collected)
-"""All that a round learns from."""
+ADDED = Stage("added", _write_collected, _read_collected)
+"""What a round adds to what is learnt from: its labelled states, and the answers around them."""
 TRAINING = Stage("training", _write_halfway, _read_halfway)
 """A training on its way."""
 TRAINED = Stage("trained", _write_trained, _read_trained)

@@ -12,8 +12,8 @@ from fdtasil.probes.answers import Answers, Beginning
 from fdtasil.rollouts.behaviours import Policy
 from fdtasil.rollouts.episodes import Episodes
 from fdtasil.run.checkpoints import (
+    ADDED,
     ASKED,
-    COLLECTED,
     RECORDED,
     TRAINED,
     Checkpoints,
@@ -113,17 +113,17 @@ class Rounds:
         student: Policy | None,
     ) -> Lesson:
         """Return all that a round learns from: recorded, labelled, and probed around."""
+        earlier = before if self.collecting else None  # a dataset that is given is all there is
 
-        def collect() -> Collected:
-            if self.collecting is not None:
-                new = self._recorded(self.collecting, round_, count, before, student)
-                return self._probed(round_, new, before, lesson)
-            assert before is not None, "the dataset is given"
-            if self.run.probes is None or self.run.probes_given:
-                return before
-            return self._probed(round_, before, None, lesson)
+        def add() -> Collected:
+            if self.collecting is None:
+                assert before is not None, "the dataset is given"
+                return self._probed(round_, before, None, lesson)
+            new = self._recorded(self.collecting, round_, count, before, student)
+            return self._probed(round_, new, earlier, lesson)
 
-        return self._lesson(self._once(round_, COLLECTED, collect), lesson)
+        added = self._once(round_, ADDED, add)
+        return self._lesson(earlier + added if earlier else added, lesson)
 
     def _lesson(self, collected: Collected, before: Lesson | None) -> Lesson:
         return Lesson.of(collected, self.student_obs, before, self.run.spread, self.run.held)
@@ -160,19 +160,13 @@ class Rounds:
     def _probed(
         self, round_: int, new: Collected, before: Collected | None, lesson: Lesson | None
     ) -> Collected:
-        """Join what is new with what was there before, and ask the probes around the new."""
-        states, old = new.dataset.demonstrations, None
-        whole = new
-        if before is not None:
-            joined = before.dataset.demonstrations + states
-            whole = replace(new, dataset=replace(before.dataset, demonstrations=joined))
-            old = before.dataset.answers
-        if self.run.probes is None:
-            return whole
-        answers = self._answers(round_, states, self._lesson(whole, lesson))
-        answers = answers if old is None else old + answers
+        """Return what is new with the answers to the probes around it."""
+        if self.run.probes is None or self.run.probes_given:
+            return new
+        whole = self._lesson(before + new if before else new, lesson)
+        answers = self._answers(round_, new.dataset.demonstrations, whole)
         source = self.checkpoints.asking.source
-        return replace(whole, dataset=replace(whole.dataset, probes=source, answers=answers))
+        return replace(new, dataset=replace(new.dataset, probes=source, answers=answers))
 
     def _answers(self, round_: int, states: Demonstrations, lesson: Lesson) -> Answers:
         """Ask the probes around a round's states; the answers are kept on the way."""
