@@ -123,9 +123,12 @@ class Rounds:
             return self._probed(round_, new, earlier, lesson)
 
         added = self._once(round_, ADDED, add)
-        return self._lesson(earlier + added if earlier else added, lesson)
+        return self._lesson(earlier, added, lesson)
 
-    def _lesson(self, collected: Collected, before: Lesson | None) -> Lesson:
+    def _lesson(
+        self, earlier: Collected | None, added: Collected, before: Lesson | None
+    ) -> Lesson:
+        collected = earlier + added if earlier else added
         return Lesson.of(collected, self.student_obs, before, self.run.spread, self.run.held)
 
     def _recorded(
@@ -163,7 +166,7 @@ class Rounds:
         """Return what is new with the answers to the probes around it."""
         if self.run.probes is None or self.run.probes_given:
             return new
-        whole = self._lesson(before + new if before else new, lesson)
+        whole = self._lesson(before, new, lesson)
         answers = self._answers(round_, new.dataset.demonstrations, whole)
         source = self.checkpoints.asking.source
         return replace(new, dataset=replace(new.dataset, probes=source, answers=answers))
