@@ -44,7 +44,7 @@ def expert(tmp_path_factory):
 
 # --- arguments
 
-_OF_ITS_OWN = {"evaluate": {"json"}, "inspect": {"json", "picture"}}
+_OF_ITS_OWN = {"distill": {"json"}, "evaluate": {"json"}, "inspect": {"json", "picture"}}
 
 
 @pytest.mark.parametrize("name", ["distill", "evaluate", "inspect"])
@@ -180,13 +180,18 @@ def test_inspect_distill_evaluate(expert, inside, tmp_path):
     assert shown.returncode == 0, shown.stderr
     for promised in ("sha256", "determinism", "batch independence", "action bounds", "return"):
         assert promised in shown.stdout
-    done = inside("distill", expert, TOY, *QUICK, "--baseline", "--out", tmp_path / "run")
+    both = ("--baseline", "--json", tmp_path / "found.json")
+    done = inside("distill", expert, TOY, *QUICK, *both, "--out", tmp_path / "run")
     assert done.returncode == 0, done.stderr
     assert done.stderr == ""  # no terminal, no bars
     for promised in ("expert", "plain cloning", "student", "queries: "):
         assert promised in done.stdout
     report = json.loads((tmp_path / "run" / "report.json").read_text())
     assert report["queries"]["probe"] == 1600  # 40 states, 40 steps, ten visits a sample
+    found = json.loads((tmp_path / "found.json").read_text())
+    assert found == {**report, "baseline": found["baseline"], "folder": str(tmp_path / "run")}
+    assert found["baseline"]["expert_return"] == report["evaluation"]["expert_return"]
+    assert found["baseline"]["student_return"] != report["evaluation"]["student_return"]
     judged = inside("evaluate", tmp_path / "run" / "student.onnx", TOY, "--expert", expert)
     assert judged.returncode == 0, judged.stderr
     assert "normalised return" in judged.stdout
@@ -206,6 +211,21 @@ def test_a_stable_baselines3_agent_becomes_an_expert(inside, tmp_path):
         shown = inside("inspect", expert, "Pendulum-v1", "--episodes", 1, cwd=tmp_path)
         assert shown.returncode == 0, shown.stderr
         assert "a torch twin agrees with it" in shown.stdout
+
+
+def test_a_script_reads_what_a_run_came_to(expert, inside, tmp_path):
+    wrong = inside("distill", expert, TOY, *QUICK, "--json", "found.txt", cwd=tmp_path)
+    assert wrong.returncode == 2
+    assert not list(tmp_path.iterdir())
+    done = inside("distill", expert, TOY, *QUICK, "--json", "-", "--out", tmp_path / "run")
+    assert done.returncode == 0, done.stderr
+    found = json.loads(done.stdout)
+    assert found["baseline"] is None
+    assert found["evaluation"]["student_return"] > 0
+    begun = ("distill", expert, TOY, *QUICK, "--resume", tmp_path / "run")
+    again = inside(*begun, "--json", "-")
+    assert again.returncode == 0, again.stderr
+    assert json.loads(again.stdout) == found
 
 
 def test_logs_are_written_beside_a_run(expert, inside, tmp_path):

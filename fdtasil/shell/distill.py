@@ -6,6 +6,7 @@ import shlex
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -36,18 +37,20 @@ from fdtasil.shell.command import (
     OptionalText,
     as_command,
 )
+from fdtasil.shell.saying import JSON_FLAG, json_file, say
 from fdtasil.student.architectures import Mlp
 from fdtasil.student.fit import Fit
 
 __all__ = ["command"]
 
 _LIMIT = 2**20  # bytes of the file with the arguments that `fdtasil distill` was called with
-_NOT_STORED = ("out", "resume", "device", "baseline")
-_BESIDE = ("resume", "max_queries", "device", "baseline")  # may be said of a run that goes on
+_NOT_STORED = ("out", "resume", "device", "baseline", "json")
+# What may be said of a run that goes on.
+_BESIDE = ("resume", "max_queries", "device", "baseline", "json")
 
 
-def _distill(baseline: bool, **arguments: Any) -> None:
-    resume = arguments["resume"]
+def _distill(baseline: bool, json: Path | None, **arguments: Any) -> None:
+    resume, file = arguments["resume"], json_file(json)
     if arguments["device"] is None:
         del arguments["device"]  # the library's own, or the one that the run was begun on
     _check_places(arguments)
@@ -68,15 +71,36 @@ def _distill(baseline: bool, **arguments: Any) -> None:
                 result = distil({**arguments, **place})
         else:
             result = distil({**arguments, **place})  # it stays in its own folder
-        print(_side_by_side(result, cloning()))
-    chosen = result.report.get("probes_chosen")
-    print(
-        f"queries: {rows_text(result.queries) or 'none'}"
-        + (f" ({shown(chosen)})" if chosen else "")
-    )
-    sizes = {name: size_text(size) for name, size in result.report["size"].items()}
-    print("; ".join(f"{name}: {text}" for name, text in sizes.items()))
-    print(f"saved in {out}: student.onnx, student.safetensors, report.json, figures/, ...")
+        say(_Outcome(result, cloning(), out), file)
+
+
+@dataclass(frozen=True)
+class _Outcome:
+    """What a run came to, with the plain cloning beside it, if there was one."""
+
+    result: Distilled
+    cloning: Evaluation | None
+    out: Path
+
+    def to_json(self) -> dict[str, Any]:
+        """Return what `report.json` holds, with the baseline's evaluation and the folder."""
+        baseline = None if self.cloning is None else self.cloning.to_json()
+        return {**self.result.report, "baseline": baseline, "folder": str(self.out)}
+
+    def __str__(self) -> str:
+        report = self.result.report
+        chosen = report.get("probes_chosen")
+        queries = f"queries: {rows_text(self.result.queries) or 'none'}"
+        sizes = (f"{name}: {size_text(size)}" for name, size in report["size"].items())
+        return "\n".join(
+            [
+                _side_by_side(self.result, self.cloning),
+                queries + (f" ({shown(chosen)})" if chosen else ""),
+                "; ".join(sizes),
+                f"saved in {self.out}: student.onnx, student.safetensors, report.json, "
+                "figures/, ...",
+            ]
+        )
 
 
 def _check_places(arguments: dict[str, Any]) -> None:
@@ -270,5 +294,6 @@ command = as_command(
             False,
             "Also clone plainly, without probes, in a process beside it, and show both.",
         ),
+        **JSON_FLAG,
     },
 )
