@@ -8,7 +8,7 @@ from PIL import Image
 from toy_forms import InForm, in_form
 
 import fdtasil
-from fdtasil.errors import EnvironmentFault, SettingError
+from fdtasil.errors import EnvironmentFault, ExportError, SettingError
 from fdtasil.rollouts.recording import HOLD
 
 pytestmark = pytest.mark.usefixtures("no_pictures")
@@ -128,6 +128,27 @@ def test_an_environment_that_breaks_is_told_as_everywhere(tmp_path):
 def test_what_can_not_be_filmed(policies, env, out, kind, tmp_path):
     with pytest.raises(kind):
         fdtasil.render(policies, env, tmp_path / out, horizon=3)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize(("suffix", "most"), [("webp", "16,383"), ("mp4", "16,384")])
+def test_a_film_too_wide_for_its_format_is_refused_before_it_is_played(suffix, most, tmp_path):
+    if suffix == "mp4":
+        pytest.importorskip("imageio_ffmpeg")
+
+    class Wide(Drawn):
+        played = 0
+
+        def step(self, action):
+            Wide.played += 1
+            return super().step(action)
+
+        def render(self):
+            return np.zeros((1, 300, 3), np.uint8)
+
+    with pytest.raises(ExportError, match=rf"19,200 x 104 pixels.*\n.*{most}"):
+        fdtasil.render({"a": rest}, Wide, tmp_path / f"f.{suffix}", horizon=3, height=64)
+    assert Wide.played == 0
     assert not list(tmp_path.iterdir())
 
 

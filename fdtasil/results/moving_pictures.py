@@ -51,6 +51,7 @@ def _mp4(pictures: Iterator[np.ndarray], fps: float) -> bytes:
     from tempfile import TemporaryDirectory
 
     first = next(pictures)
+    _check_sides(first, "MP4", 2**14)
     with TemporaryDirectory() as folder:
         file = Path(folder, "film.mp4")
         writer = imageio_ffmpeg.write_frames(
@@ -72,7 +73,7 @@ def _mp4(pictures: Iterator[np.ndarray], fps: float) -> bytes:
 
 
 def _still(
-    kind: str, grain: int, least: int, **options: Any
+    kind: str, grain: int, least: int, most: int, **options: Any
 ) -> Callable[[Iterator[np.ndarray], float], bytes]:
     """Return what writes a format of pictures that move.
 
@@ -80,6 +81,7 @@ def _still(
         kind: What Pillow calls it.
         grain: Milliseconds that it counts in.
         least: Milliseconds that viewers show a picture for at least.
+        most: Pixels of a side.
         **options: Of Pillow.
     """
 
@@ -87,6 +89,8 @@ def _still(
         kept, times = [], []
         last = None
         for number, last in enumerate(pictures):
+            if not number:
+                _check_sides(last, kind, most)
             time = grain * round(1000 * number / fps / grain)
             if not times or time - times[-1] >= least:
                 kept.append(Image.fromarray(last))
@@ -103,9 +107,19 @@ def _still(
     return write
 
 
+def _check_sides(picture: np.ndarray, kind: str, most: int) -> None:
+    height, width, _ = picture.shape
+    if max(height, width) > most:
+        raise ExportError(
+            f"a film of {width:,} x {height:,} pixels",
+            f"at most {most:,} a side in a {kind}",
+            "pass a smaller height=, or fewer policies",
+        )
+
+
 WRITERS: dict[str, Callable[[Iterator[np.ndarray], float], bytes]] = {
     ".mp4": _mp4,
-    ".webp": _still("WEBP", 1, 1, quality=60, method=4),
-    ".gif": _still("GIF", 10, 20, optimize=True),  # many take a shorter time for 100
+    ".webp": _still("WEBP", 1, 1, 2**14 - 1, quality=60, method=4),
+    ".gif": _still("GIF", 10, 20, 2**16 - 1, optimize=True),  # many take a shorter time for 100
 }
 """Every format by the suffix of its file."""

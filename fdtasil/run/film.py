@@ -57,7 +57,8 @@ def render(
             or anything else that an expert may be.
         env: A gymnasium id, an `Environment`, or a function that makes an environment with
             `render_mode="rgb_array"`.
-        out: Ends with .mp4 (`pip install "fdtasil[video]"`), .webp or .gif.
+        out: Ends with .mp4 (`pip install "fdtasil[video]"`), .webp or .gif. The last two are
+            for short films: their pictures are in memory until all are drawn.
         seed: Of the start.
         horizon: Steps after which the episode is cut; default: the environment's time limit.
         every: Steps between two pictures; the film keeps the environment's pace.
