@@ -463,6 +463,8 @@ def test_what_was_made_and_is_refused_is_closed():
 def test_an_expert_that_is_called_wrongly_is_told_what_it_is_given():
     with pytest.raises(ExpertError, match=r"place \(B, 2\), speed \(B, 2\)|rest \(B, 1\)"):
         fdtasil.distill(lambda rows: rows[:, :2], lambda: InForm("dictionary"), 0, **QUICK)
+    with pytest.raises(ExpertError, match=r"with shape \(16, 1, 2\); .* \(B, 1, 5\)"):
+        fdtasil.distill(lambda rows: rows[..., :2], lambda: InForm("row"), 0, **QUICK)
 
 
 def test_a_result_is_judged_as_it_is():

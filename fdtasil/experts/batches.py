@@ -136,8 +136,10 @@ class Batches:
         if answer.shape == (len(rows), 1) and self.action_size and np.isnan(answer).all():
             answer = np.repeat(answer, self.action_size, axis=1)  # nulls in the place of rows
         if answer.ndim != 2 or len(answer) != len(rows) or not self._has_action_size(answer):
+            asked = len(rows) if self.parts else rows.shape
+            given = f"; {self._given}" if self.parts else ""
             raise ExpertError(
-                f"{self.name} answered {rows.shape} observations with shape {answer.shape}",
+                f"{self.name} answered {asked} observations with shape {answer.shape}{given}",
                 expected,
                 _advice(answer, len(rows), self.action_size),
             )
