@@ -290,8 +290,22 @@ def test_a_wrong_answer_is_described(answer, found, rows):
 
 
 def test_something_else_is_no_expert():
-    with pytest.raises(ExpertError, match="expert is a int"):
+    with pytest.raises(ExpertError, match="type int"):
         load_expert(3)
+
+
+def test_what_holds_an_expert_is_told_how_to_pass_it():
+    class Others:
+        def select_action(self, rows):
+            return rows[:, :2]
+
+    class Result:
+        student = torch.nn.Identity()
+
+    with pytest.raises(ExpertError, match=r"pass its method, expert\.select_action"):
+        load_expert(Others())
+    with pytest.raises(ExpertError, match=r"result\.student"):
+        load_expert(Result())
 
 
 @pytest.mark.fault(53)

@@ -235,11 +235,27 @@ def _kind_of(source: object) -> "Kind":
         if kind.recognises(source):
             return kind
     raise ExpertError(
-        f"expert is a {type(source).__name__}",
+        f"the expert, of type {type(source).__name__}",
         "an ONNX path, a torch module, an object with predict, or a function on batches",
-        "wrap it: lambda observations: ...  ((B, n) -> (B, m)); what remembers has "
-        "predict(observations, state, episode_start) -> (actions, state)",
+        _how_to_pass(source),
     )
+
+
+def _how_to_pass(source: object) -> str:
+    """Return what makes an expert of an object that is none."""
+    if isinstance(getattr(source, "student", None), torch.nn.Module):
+        return "of a result, pass its student: result.student"
+    for name in _OTHER_NAMES:
+        if callable(getattr(source, name, None)):
+            return f"pass its method, expert.{name}, if that takes (B, n) and returns (B, m)"
+    return (
+        "wrap it: lambda observations: ...  ((B, n) -> (B, m)); what remembers has "
+        "predict(observations, state, episode_start) -> (actions, state)"
+    )
+
+
+_OTHER_NAMES = ("act", "get_action", "select_action", "compute_action", "compute_actions")
+"""What other libraries call `predict`."""
 
 
 def _opener(source: ExpertLike, expert: Expert, hints: Hints) -> Callable[[], Policy] | None:
