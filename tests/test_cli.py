@@ -283,6 +283,8 @@ def test_stored_probes_need_not_be_repeated(linear, inside, tmp_path):
             ["distill", "EXPERT", TOY, "--prbes", "3"], 2, "--probes", marks=pytest.mark.fault(107)
         ),
         (["distil"], 2, "distill"),
+        (["report", "nothing"], 1, "there is no folder nothing"),
+        (["report", "EXPERT"], 1, "e.onnx is a file"),
         ([], 2, "no command"),
         (["distill", "EXPERT", TOY, "--activation", "gellu"], 2, "activation='gellu'"),
         (["distill", "EXPERT", TOY, "--steps", "0"], 2, "steps=0"),

@@ -27,6 +27,7 @@ __all__ = [
     "begun_over",
     "check_finished",
     "check_free",
+    "check_run",
     "stamped",
     "unstamped",
 ]
@@ -85,6 +86,21 @@ def _another_format(number: object, values: Mapping[str, Any], source: object) -
         f"format {FORMAT}",
         f"go on with {by}, which wrote it, or start anew in another folder",
     )
+
+
+def check_run(folder: Path) -> None:
+    """Refuse what is no folder of a finished run, before any of it is read.
+
+    Raises:
+        StorageError: If it is another thing.
+    """
+    if not folder.is_dir():
+        raise StorageError(
+            f"{folder} is a file" if folder.exists() else f"there is no folder {folder}",
+            "the folder of a finished run, from save() or out= (--out)",
+            "check the path",
+        )
+    check_finished(folder)
 
 
 def check_finished(folder: Path) -> None:

@@ -28,8 +28,8 @@ from fdtasil.files.run_format import (
     REPORT,
     STATES,
     WEIGHTS,
-    check_finished,
     check_free,
+    check_run,
     stamped,
     unstamped,
 )
@@ -250,7 +250,7 @@ class Distilled:
 
     @classmethod
     def _read(cls, folder: Path) -> "Distilled":
-        check_finished(folder)
+        check_run(folder)
         files = verify(folder, edited=(CARD,))
         settings = unstamped(files[CONFIG], folder / CONFIG, older=True)
         for name in _COUNTS & settings.keys():

@@ -20,7 +20,7 @@ from fdtasil.files.run_format import (
     REPORT,
     STATES,
     WEIGHTS,
-    check_finished,
+    check_run,
 )
 from fdtasil.files.storage import MANIFEST, verify
 from fdtasil.results.figures import FIGURES
@@ -48,7 +48,7 @@ def parcel_of(folder: Path, *, demonstrations: bool = False) -> dict[str, bytes]
     Raises:
         StorageError: If it is no whole run folder.
     """
-    check_finished(folder)
+    check_run(folder)
     files = verify(folder, edited=(CARD,))
     if demonstrations:
         return {**files, MANIFEST: read_plain(folder / MANIFEST, FILE_LIMIT, follow=False)}
