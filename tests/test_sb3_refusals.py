@@ -62,8 +62,8 @@ UNTRUSTED = {
 }
 HOPELESS = {
     "images": policy_class("stable_baselines3.common.policies", "ActorCriticCnnPolicy"),
-    "dictionaries": policy_class(
-        "stable_baselines3.common.policies", "MultiInputActorCriticPolicy"
+    "masks on dictionaries": policy_class(
+        "sb3_contrib.common.maskable.policies", "MaskableMultiInputActorCriticPolicy"
     ),
     "memory on images": policy_class(
         "sb3_contrib.common.recurrent.policies", "RecurrentActorCriticCnnPolicy"

@@ -26,6 +26,7 @@ from fdtasil.experts.own_jacobian import own_jacobian
 from fdtasil.experts.picking import Picks, PicksOutput
 from fdtasil.experts.predicting import open_predictor
 from fdtasil.experts.sb3.agent import read_agent
+from fdtasil.experts.sb3.observations import check_parts
 from fdtasil.experts.sb3.randomness import randomness_kept
 from fdtasil.experts.sb3.recurrent import RecurrentNetwork
 from fdtasil.experts.sb3.trust import Trust
@@ -306,6 +307,8 @@ def _from_hub(uri: str | Path, hints: Hints) -> Expert:
 
 def _from_agent(path: str | Path, hints: Hints) -> Expert:
     agent = read_agent(path, trust=None if hints.trust == "c" else hints.trust)
+    if hints.spaces is not None:
+        check_parts(agent.parts, hints.spaces.observations, str(path))
     origin = Origin(str(path), agent.sha256)
     if isinstance(agent.module, RecurrentNetwork):
         n, step = agent.observation_size, agent.module.step

@@ -16,6 +16,7 @@ from fdtasil.experts.sb3.network import (
     Rescale,
     build_network,
 )
+from fdtasil.experts.sb3.observations import read_observed
 from fdtasil.experts.sb3.recipes import Recipe, check_policy, find_recipe, read_activation
 from fdtasil.experts.sb3.recurrent import (
     RECURRENT,
@@ -49,6 +50,8 @@ class Agent:
         algorithm: "SAC", "TD3", "DDPG", "TQC", "PPO", "A2C", "TRPO", "DQN", "QRDQN" or
             "RecurrentPPO".
         observation_size: n.
+        parts: Name and size of each part of a dictionary that it observes, as they stand side by
+            side in the flat form; () for one array.
         action_low: (m,) float32, lower action bounds in environment units; scores have none.
         action_high: (m,) float32, upper bounds.
         module: (B, n) float32 raw observations -> (B, m) float32 actions in environment units,
@@ -64,6 +67,7 @@ class Agent:
 
     algorithm: str
     observation_size: int
+    parts: tuple[tuple[str, int], ...]
     action_low: np.ndarray
     action_high: np.ndarray
     module: nn.Module
@@ -93,8 +97,8 @@ def read_agent(
 
     Args:
         path: The zip of a SAC, TD3, DDPG, TQC, PPO, A2C, TRPO, DQN or QR-DQN agent with an MLP
-            policy, or of a RecurrentPPO with an LSTM before one; its ".zip" may be left out, as in
-            stable-baselines3.
+            policy, on vectors or on dictionaries of them, or of a RecurrentPPO with an LSTM
+            before one; its ".zip" may be left out, as in stable-baselines3.
         trust: "pickle" to have stable-baselines3 load what can't be read otherwise: gSDE, custom
             policies, feature extractors and activations, and the statistics of VecNormalize. That
             runs any code that is in such a file.
@@ -120,9 +124,14 @@ def read_agent(
     path = _find(path)
     archive = read_archive(path)
     check_policy(archive.record, str(path))
-    n, m = (
-        read_size(archive.record, f"{kind}_space", str(path)) for kind in ("observation", "action")
-    )
+    observed = read_observed(archive.record, str(path))
+    n, m = observed.size, read_size(archive.record, "action_space", str(path))
+    if observed.parts and vecnormalize not in (None, False, "False"):
+        raise ExpertError(
+            f"vecnormalize={str(vecnormalize)!r} of {path}, which observes a dictionary",
+            "statistics of one array",
+            ITSELF,
+        )
     given = given_bounds(action_low, action_high, m)
     statistics, statistics_sha256 = read_statistics(archive, vecnormalize, n, trust)
     if is_recurrent(archive.record):
@@ -131,6 +140,7 @@ def read_agent(
         return Agent(
             RECURRENT.algorithm,
             n,
+            observed.parts,
             bounds.low,
             bounds.high,
             module.eval().requires_grad_(False),
@@ -151,6 +161,7 @@ def read_agent(
     return Agent(
         recipe.algorithm,
         n,
+        observed.parts,
         bounds.low,
         bounds.high,
         nn.Sequential(*parts).eval().requires_grad_(False),
@@ -182,7 +193,8 @@ def _read_network(
     try:
         return _rebuilt(archive, recipe, sizes, given)
     except ExpertError as refusal:
-        if choice_sizes(archive.record) and refusal.next_step == TRUST:
+        untrusted = choice_sizes(archive.record) or read_observed(archive.record, "").parts
+        if untrusted and refusal.next_step == TRUST:
             raise ExpertError(refusal.found, refusal.expected, ITSELF) from refusal
         if trust is None or refusal.next_step != TRUST:
             raise

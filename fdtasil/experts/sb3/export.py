@@ -11,6 +11,7 @@ from fdtasil.checks import check_suffix
 from fdtasil.compute import ask_module
 from fdtasil.errors import ExpertError, ExportError, SettingError
 from fdtasil.experts.sb3.agent import Agent, read_agent
+from fdtasil.experts.sb3.observations import check_parts
 from fdtasil.experts.sb3.statistics import VecNormalizePath
 from fdtasil.experts.sb3.trust import Trust
 from fdtasil.experts.sizes import size_hint
@@ -45,7 +46,7 @@ def export_sb3(
 
     Args:
         agent_zip: The zip of a SAC, TD3, DDPG, TQC, PPO, A2C, TRPO, DQN or QR-DQN agent with an
-            MLP policy.
+            MLP policy, on vectors or on dictionaries of them.
         out: The file to write.
         env: The agent's environment. It is checked that it fits, and the file is compared with
             the agent on states of a short rollout; without it, on random states.
@@ -126,6 +127,7 @@ def _check_fit(agent: Agent, pool: EnvironmentPool) -> None:
             if found[0] != expected[0]
             else "check the environment's version, options and wrappers",
         )
+    check_parts(agent.parts, pool.spaces.observations, str(agent.source))
     pairs = ((agent.action_low, boxes.low), (agent.action_high, boxes.high))
     if not all(np.allclose(ours, theirs, rtol=1e-5) for ours, theirs in pairs):
         raise ExpertError(

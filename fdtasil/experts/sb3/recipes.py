@@ -49,6 +49,11 @@ class Recipe:
     quantiles: str | None = None
 
 
+def _known(module: str, policy: str) -> frozenset[str]:
+    """Return the classes of an algorithm's policies on vectors, and on dictionaries of them."""
+    return frozenset({f"{module}.{policy}", f"{module}.MultiInputPolicy"})
+
+
 _GAUSSIAN = {
     "layers": ("actor.latent_pi", "actor.mu"),
     "unused": ("actor.log_std", "critic", "critic_target"),
@@ -56,7 +61,7 @@ _GAUSSIAN = {
     "squashed": True,
 }
 _DETERMINISTIC = {
-    "policies": frozenset({"stable_baselines3.td3.policies.TD3Policy"}),
+    "policies": _known("stable_baselines3.td3.policies", "TD3Policy"),
     "layers": ("actor.mu",),
     "unused": ("actor_target", "critic", "critic_target"),
     "activation": nn.ReLU,
@@ -66,6 +71,7 @@ _ON_POLICY = {
     "policies": frozenset(
         {
             "stable_baselines3.common.policies.ActorCriticPolicy",
+            "stable_baselines3.common.policies.MultiInputActorCriticPolicy",
             "stable_baselines3.ppo.policies.PPOPolicy",  # until 0.7
         }
     ),
@@ -81,7 +87,7 @@ RECIPES = (
     Recipe(
         "TQC",
         {"top_quantiles_to_drop_per_net": None},
-        frozenset({"sb3_contrib.tqc.policies.TQCPolicy"}),
+        _known("sb3_contrib.tqc.policies", "TQCPolicy"),
         package="sb3_contrib",
         **_GAUSSIAN,
     ),
@@ -89,13 +95,13 @@ RECIPES = (
         "SAC",
         # CrossQ has the first two as well, and batch normalisation in its actor.
         {"target_entropy": None, "ent_coef": None, "target_update_interval": None},
-        frozenset({"stable_baselines3.sac.policies.SACPolicy"}),
+        _known("stable_baselines3.sac.policies", "SACPolicy"),
         **_GAUSSIAN,
     ),
     Recipe(
         "QRDQN",
         {"exploration_fraction": None, "n_quantiles": None},
-        frozenset({"sb3_contrib.qrdqn.policies.QRDQNPolicy"}),
+        _known("sb3_contrib.qrdqn.policies", "QRDQNPolicy"),
         ("quantile_net.quantile_net",),
         ("quantile_net_target",),
         package="sb3_contrib",
@@ -105,7 +111,7 @@ RECIPES = (
     Recipe(
         "DQN",
         {"exploration_fraction": None, "target_update_interval": None},
-        frozenset({"stable_baselines3.dqn.policies.DQNPolicy"}),
+        _known("stable_baselines3.dqn.policies", "DQNPolicy"),
         ("q_net.q_net",),
         ("q_net_target",),
         **_OF_CHOICES,
@@ -125,7 +131,9 @@ _ACTIVATIONS: dict[str, type[nn.Module]] = {
         *(nn.ReLU, nn.ReLU6, nn.SELU, nn.SiLU, nn.Sigmoid, nn.Softplus, nn.Softsign, nn.Tanh),
     )
 }
-_FLATTEN = {
+# Those that lay the numbers of an observation side by side; images in it have weights.
+_SIDE_BY_SIDE = {
+    "<class 'stable_baselines3.common.torch_layers.CombinedExtractor'>",
     "<class 'stable_baselines3.common.torch_layers.FlattenExtractor'>",
     "<class 'stable_baselines3.common.policies.FlattenExtractor'>",  # until 0.8
 }
@@ -144,8 +152,8 @@ _UNFIT = {
         "choose or train an agent with memory on flat observations",
     ),
     r"(stable_baselines3|sb3_contrib)\..*Cnn": ("a policy on images", f"{ITSELF} with probes=0"),
-    r"(stable_baselines3|sb3_contrib)\..*MultiInput": (
-        "a policy on dictionaries of observations",
+    r"sb3_contrib\..*maskable.*MultiInput": (
+        "a policy with masks on dictionaries of observations",
         ITSELF,
     ),
     r"sbx\.": ("a policy of sbx, whose weights are JAX's", ITSELF),
@@ -154,7 +162,7 @@ _UNFIT = {
 
 
 def check_policy(record: Record, source: str) -> None:
-    """Refuse a policy that needs more than flat observations, or is another library's.
+    """Refuse a policy on images, with masks on dictionaries, or of another library.
 
     Raises:
         ExpertError: If it is one.
@@ -211,8 +219,9 @@ def read_activation(record: Record, recipe: Recipe, source: str) -> type[nn.Modu
     if settings.get("squash_output"):
         raise _cannot(source, "squashes its output", "the usual output of its algorithm")
     extractor = _text(settings, "features_extractor_class")
-    if extractor is not None and extractor not in _FLATTEN:
-        raise _cannot(source, f"has the feature extractor {extractor}", "FlattenExtractor")
+    if extractor is not None and extractor not in _SIDE_BY_SIDE:
+        expected = "FlattenExtractor, or CombinedExtractor"
+        raise _cannot(source, f"has the feature extractor {extractor}", expected)
     activation = _text(settings, "activation_fn")
     if activation is not None and activation not in _ACTIVATIONS:
         names = ", ".join(kind.__name__ for kind in _ACTIVATIONS.values())

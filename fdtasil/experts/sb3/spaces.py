@@ -1,5 +1,6 @@
 """The two spaces of an agent, from the text that stands beside their pickles."""
 
+import math
 import re
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -11,10 +12,19 @@ from numpy.typing import ArrayLike
 from fdtasil.errors import ExpertError, SettingError, shown
 from fdtasil.experts.sb3.trust import ITSELF
 
-__all__ = ["Bounds", "choice_sizes", "given_bounds", "no_bounds", "read_bounds", "read_size"]
+__all__ = [
+    "LARGEST",
+    "Bounds",
+    "choice_sizes",
+    "given_bounds",
+    "no_bounds",
+    "read_bounds",
+    "read_size",
+]
 
 _BOX = re.compile(r"<class '(?:gym|gymnasium)\.spaces\.box\.Box'>")
-_LARGEST = 10**6
+LARGEST = 10**6
+"""A size that no agent reaches: one above it may be there to fill the memory."""
 _CHOICE = re.compile(
     r"<class '(?:gym|gymnasium)\.spaces\.(?:multi_)?discrete\.(?:Multi)?Discrete'>"
 )
@@ -35,7 +45,7 @@ def choice_sizes(record: Mapping[str, Any]) -> tuple[int, ...]:
         return ()
     text = str(entry.get("nvec", entry.get("n")))
     sizes = tuple(int(word) for word in re.findall(r"\d+", text)) if len(text) < 10_000 else ()
-    return sizes if sizes and all(1 < size <= _LARGEST for size in sizes) else ()
+    return sizes if sizes and all(1 < size <= LARGEST for size in sizes) else ()
 
 
 def no_bounds(size: int) -> Bounds:
@@ -64,12 +74,15 @@ def read_size(record: Mapping[str, Any], name: str, source: str) -> int:
     shape = entry.get("_shape", entry.get("shape"))  # gym called it shape until 0.19
     if _BOX.fullmatch(kind) and (name != "action_space" or "float" in dtype):
         sizes = shape if isinstance(shape, list) else []
-        # A size that no agent has may be there to fill the memory.
-        if len(sizes) == 1 and isinstance(sizes[0], int) and 0 < sizes[0] <= _LARGEST:
-            return sizes[0]
+        # A stack of frames is laid in a row; of three dimensions, it may be an image.
+        usual = 0 < len(sizes) < (2 if name == "action_space" else 3)
+        if usual and all(isinstance(size, int) and 0 < size <= LARGEST for size in sizes):
+            if math.prod(sizes) <= LARGEST:
+                return math.prod(sizes)
     raise ExpertError(
         shown(f"{source} has the {name} {kind} of shape {shape} and dtype {dtype}"),
-        "a Box of floats with one dimension" + ", or choices" * (name == "action_space"),
+        "a Box of floats with one dimension"
+        + (", or choices" if name == "action_space" else ", or of frames with two"),
         ITSELF,
     )
 
