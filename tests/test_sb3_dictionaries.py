@@ -9,10 +9,11 @@ import pytest
 import torch
 from conftest import QUICK
 from gymnasium.spaces import Box, Dict, Discrete, MultiBinary, MultiDiscrete
-from sb3_agents import fresh_agent, save_agent, shake
+from sb3_agents import fresh_agent, save_agent, seeded, shake
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
 import fdtasil
-from fdtasil.errors import ExpertError
+from fdtasil.errors import ExpertError, FdtasilWarning
 from fdtasil.experts.sb3.agent import read_agent
 from fdtasil.experts.sb3.export import export_sb3
 from fdtasil.experts.sb3.observations import read_observed
@@ -144,9 +145,33 @@ def test_images_and_what_needs_trust_are_passed_themselves(tmp_path):
     _, path = saved(tmp_path, activation_fn=torch.nn.PReLU)
     with pytest.raises(ExpertError, match=r"PReLU(.*\n)*.*the agent itself"):
         read_agent(path, trust="pickle")
-    _, path = saved(tmp_path)
-    with pytest.raises(ExpertError, match="observes a dictionary"):
-        read_agent(path, trust="pickle", vecnormalize=tmp_path / "stats.pkl")
+
+
+def test_statistics_of_some_parts(tmp_path):
+    venv = VecNormalize(DummyVecEnv([Drawn]), norm_obs_keys=["observation", "desired_goal"])
+    kind = {"policy": "MultiInputPolicy", "n_steps": 8, "batch_size": 8}
+    agent = fresh_agent("PPO", venv, {"net_arch": [8]}, **kind)
+    with seeded():
+        agent.learn(16)
+    venv.training, venv.clip_obs = False, 0.5
+    path = save_agent(tmp_path, shake(agent))
+    with pytest.warns(FdtasilWarning, match="trained in VecNormalize"):
+        fdtasil.load_expert(path)
+    venv.save(tmp_path / "stats.pkl")
+    with pytest.raises(ExpertError, match=r"stats\.pkl is a Python pickle"):
+        read_agent(path, vecnormalize=tmp_path / "stats.pkl")
+    read = read_agent(path, vecnormalize=tmp_path / "stats.pkl", trust="pickle")
+    layout, drawn = layout_of(GOAL, "observations"), Drawn()
+    seen = [drawn.reset(seed=seed)[0] for seed in range(32)]
+    rows = np.stack([layout.row(one) for one in seen]).astype(np.float32)
+    found = read.module(torch.from_numpy(rows)).numpy()
+    expected = agent.predict(venv.normalize_obs(layout.values(rows)), deterministic=True)[0]
+    assert np.abs(found - expected).max() <= 1e-5
+    plain = agent.predict(layout.values(rows), deterministic=True)[0]
+    assert np.abs(found - plain).max() > 0.01
+    _, other = saved(tmp_path, observations=MIXED)
+    with pytest.raises(ExpertError, match="it has statistics of observation, desired_goal"):
+        read_agent(other, vecnormalize=tmp_path / "stats.pkl", trust="pickle")
 
 
 @pytest.mark.parametrize(

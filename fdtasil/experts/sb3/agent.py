@@ -126,14 +126,8 @@ def read_agent(
     check_policy(archive.record, str(path))
     observed = read_observed(archive.record, str(path))
     n, m = observed.size, read_size(archive.record, "action_space", str(path))
-    if observed.parts and vecnormalize not in (None, False, "False"):
-        raise ExpertError(
-            f"vecnormalize={str(vecnormalize)!r} of {path}, which observes a dictionary",
-            "statistics of one array",
-            ITSELF,
-        )
     given = given_bounds(action_low, action_high, m)
-    statistics, statistics_sha256 = read_statistics(archive, vecnormalize, n, trust)
+    statistics, statistics_sha256 = read_statistics(archive, vecnormalize, observed, trust)
     if is_recurrent(archive.record):
         before = nn.Identity() if statistics is None else Normalise(statistics)
         module, bounds = _recurrent(archive, (n, m), given, before)

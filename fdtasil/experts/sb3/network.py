@@ -25,12 +25,13 @@ class ObservationStatistics:
     Attributes:
         mean: (n,) float64.
         scale: (n,) float64, the standard deviation with epsilon in it.
-        clip: Largest absolute value of a normalised observation.
+        clip: (n,) float64, the largest absolute value of a normalised number; infinite where
+            nothing is normalised.
     """
 
     mean: np.ndarray
     scale: np.ndarray
-    clip: float
+    clip: np.ndarray
 
 
 class Normalise(nn.Module):
@@ -39,6 +40,7 @@ class Normalise(nn.Module):
     mean: Tensor
     rest: Tensor
     scale: Tensor
+    clip: Tensor
 
     def __init__(self, statistics: ObservationStatistics) -> None:
         super().__init__()
@@ -48,20 +50,20 @@ class Normalise(nn.Module):
         self.register_buffer("mean", torch.from_numpy(mean))
         self.register_buffer("rest", torch.from_numpy(statistics.mean - mean).float())
         self.register_buffer("scale", torch.from_numpy(statistics.scale).float())
-        self.clip = statistics.clip
+        self.register_buffer("clip", torch.from_numpy(statistics.clip).float())
 
     def forward(self, observations: Tensor) -> Tensor:
         """(B, n) raw -> (B, n) normalised observations."""
         normalised = (observations - self.mean - self.rest) / self.scale
-        return normalised.clamp(-self.clip, self.clip)
+        return torch.minimum(torch.maximum(normalised, -self.clip), self.clip)
 
     def write_onnx(self, nodes: Nodes, value: str) -> str:
         """Add its nodes to an ONNX graph; see `Writable`."""
         for shift in (self.mean, self.rest):
             value = nodes.node("Sub", value, nodes.constant(shift))
         normalised = nodes.node("Div", value, nodes.constant(self.scale))
-        low, high = nodes.constant(-self.clip), nodes.constant(self.clip)
-        return nodes.node("Clip", normalised, low, high)
+        raised = nodes.node("Max", normalised, nodes.constant(-self.clip))
+        return nodes.node("Min", raised, nodes.constant(self.clip))
 
 
 class _Bounded(nn.Module):

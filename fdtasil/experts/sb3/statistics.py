@@ -11,6 +11,7 @@ import numpy as np
 from fdtasil.errors import ExpertError, SettingError, warn
 from fdtasil.experts.sb3.archive import Archive, read_file
 from fdtasil.experts.sb3.network import ObservationStatistics
+from fdtasil.experts.sb3.observations import Observed
 from fdtasil.experts.sb3.trust import Trust
 from fdtasil.files.storage import sha256
 
@@ -20,7 +21,7 @@ VecNormalizePath = str | Path | Literal[False] | None
 
 
 def read_statistics(
-    agent: Archive, given: VecNormalizePath, observation_size: int, trust: Trust
+    agent: Archive, given: VecNormalizePath, observed: Observed, trust: Trust
 ) -> tuple[ObservationStatistics | None, str | None]:
     """Read what an agent's observations are normalised with.
 
@@ -28,7 +29,7 @@ def read_statistics(
         agent: The zip, for a look at what it says, and at what lies beside it.
         given: The file, False (or the word "False", as a shell says it) where there is none, or
             None where nothing was said.
-        observation_size: n.
+        observed: What the agent observes.
         trust: Must be "pickle" where there is a file.
 
     Returns:
@@ -57,10 +58,10 @@ def read_statistics(
         )
     from fdtasil.experts.sb3.trusted import unpickle_statistics
 
-    statistics = unpickle_statistics(file, data)
+    statistics = unpickle_statistics(file, data, observed)
     if statistics is None:
         return None, None
-    _check(statistics, observation_size, file)
+    _check(statistics, observed.size, file)
     return statistics, sha256(data)
 
 
@@ -79,6 +80,9 @@ def _check_neighbours(agent: Path) -> None:
     )
 
 
+_KEPT = {f"<class '{name}'>" for name in ("numpy.ndarray", "dict", "collections.OrderedDict")}
+
+
 def _check_record(agent: Archive) -> None:
     """Warn of an agent that was trained in VecNormalize, whose statistics are not here.
 
@@ -87,7 +91,7 @@ def _check_record(agent: Archive) -> None:
     """
     kept = agent.record.get("_last_original_obs")
     kind = kept.get(":type:") if isinstance(kept, dict) else None
-    if "gae_lambda" not in agent.record or kind != "<class 'numpy.ndarray'>":
+    if "gae_lambda" not in agent.record or kind not in _KEPT:
         return
     warn(
         f"{agent.path} was trained in VecNormalize, and its statistics are not given: if it "

@@ -15,6 +15,7 @@ from torch import Tensor, nn
 from fdtasil.errors import ExpertError, first_line
 from fdtasil.experts.sb3.archive import Archive
 from fdtasil.experts.sb3.network import Clip, ObservationStatistics, Rescale
+from fdtasil.experts.sb3.observations import Observed
 from fdtasil.experts.sb3.randomness import randomness_kept
 from fdtasil.experts.sb3.recipes import Recipe, has_usual_policy
 from fdtasil.experts.sb3.spaces import Bounds, read_bounds
@@ -82,8 +83,15 @@ def unpickle_agent(
     return policy, squashed, bounds
 
 
-def unpickle_statistics(path: Path, data: bytes) -> ObservationStatistics | None:
+def unpickle_statistics(
+    path: Path, data: bytes, observed: Observed
+) -> ObservationStatistics | None:
     """Load what `VecNormalize.save` wrote.
+
+    Args:
+        path: The file.
+        data: What is in it.
+        observed: What the agent observes.
 
     Returns:
         The statistics, or None where observations were not normalised.
@@ -95,17 +103,37 @@ def unpickle_statistics(path: Path, data: bytes) -> ObservationStatistics | None
         wrapper: Any = _Unpickler(io.BytesIO(data)).load()
         if not wrapper.norm_obs:
             return None
-        mean, variance = (
-            np.asarray(x, np.float64) for x in (wrapper.obs_rms.mean, wrapper.obs_rms.var)
-        )
-        scale = np.sqrt(variance + wrapper.epsilon)
-        return ObservationStatistics(mean, scale, float(wrapper.clip_obs))
+        if not observed.parts:
+            return _statistics(wrapper, wrapper.obs_rms)
+        named = wrapper.obs_rms
+        if not set(named) <= {name for name, _ in observed.parts}:
+            raise ValueError(f"it has statistics of {', '.join(map(str, named))}")
+        parts = [
+            _statistics(wrapper, named[name]) if name in named else _none_of(size)
+            for name, size in observed.parts
+        ]
+        joined = (np.concatenate([getattr(one, name) for one in parts]) for name in _FIELDS)
+        return ObservationStatistics(*joined)
     except Exception as error:  # unpickling may raise anything
         raise ExpertError(
             f"{path} can't be used: {first_line(error)}",
-            "what VecNormalize.save() wrote, for flat observations",
+            "what VecNormalize.save() wrote, for the agent's observations",
             "install what it names, or save it again with a current stable-baselines3",
         ) from error
+
+
+_FIELDS = ("mean", "scale", "clip")
+
+
+def _statistics(wrapper: Any, moments: Any) -> ObservationStatistics:
+    mean, variance = (np.asarray(x, np.float64).ravel() for x in (moments.mean, moments.var))
+    clip = np.full(len(mean), float(wrapper.clip_obs))
+    return ObservationStatistics(mean, np.sqrt(variance + wrapper.epsilon), clip)
+
+
+def _none_of(size: int) -> ObservationStatistics:
+    """Return the statistics of a part that is left as it is."""
+    return ObservationStatistics(np.zeros(size), np.ones(size), np.full(size, np.inf))
 
 
 class _Unpickler(pickle.Unpickler):
