@@ -589,7 +589,15 @@ class Named(Integrator):
         return {name: np.asarray(part, np.float32) for name, part in names.items()}
 
 
-@pytest.mark.parametrize("spread", [{"constant": 0.5, 1: 2.0}, "constant:0.5, 1:2.0"])
+@pytest.mark.parametrize(
+    "spread",
+    [
+        {"constant": 0.5, 1: 2.0},
+        "constant:0.5, 1:2.0",
+        "{'constant': 0.5, 1: 2.0}",
+        '{"constant": 0.5, "1": 2.0}',
+    ],
+)
 def test_a_spread_of_a_part_is_said_by_its_name(spread):
     law = lambda seen: -0.3 * (seen["position"] + seen["velocity"])  # noqa: E731
     result = fdtasil.distill(law, Named, 3, spread=spread, **QUICK)

@@ -20,7 +20,7 @@ too; or "bounds", the deviations of uniform values in the bounds of the observat
 
 _STILL = 1e-3  # of what a coordinate varies between episodes, that it may vary within one
 _EXPECTED = 'a deviation for each coordinate, or "bounds"'
-_EXAMPLE = "write for example spread={0: 0.5}"
+_EXAMPLE = "write for example spread={0: 0.5}, in a shell --spread 0:0.5"
 
 
 @dataclass(frozen=True)
@@ -132,7 +132,9 @@ def _columns(key: object, value: object, layout: Layout | None) -> tuple[object,
 
 
 def _coordinate(text: str) -> int | str:
-    """Return a number, or the name of a part."""
+    """Return a number, or the name of a part, in quotation marks or without."""
+    if len(text) > 1 and text[0] == text[-1] and text[0] in "'\"":
+        text = text[1:-1]
     if not text:
         raise ValueError("a deviation of nothing")
     try:
@@ -142,9 +144,12 @@ def _coordinate(text: str) -> int | str:
 
 
 def _read(text: str) -> dict[int | str, float]:
-    """Read "3:0.5,goal:0.1"."""
+    """Read "3:0.5,goal:0.1", in the braces of Python too, as a warning writes them."""
+    inside = text.strip()
+    if inside.startswith("{") and inside.endswith("}"):
+        inside = inside[1:-1]
     try:
-        pairs = [part.rpartition(":")[::2] for part in text.split(",")]
+        pairs = [part.rpartition(":")[::2] for part in inside.split(",")]
         read = {_coordinate(one.strip()): float(deviation) for one, deviation in pairs}
         if len(read) < len(pairs):
             raise ValueError("a coordinate twice")
