@@ -300,7 +300,8 @@ def test_what_holds_an_expert_is_told_how_to_pass_it():
             return rows[:, :2]
 
     class Result:
-        student = torch.nn.Identity()
+        def __init__(self):
+            self.student = torch.nn.Identity()
 
     with pytest.raises(ExpertError, match=r"pass its method, expert\.select_action"):
         load_expert(Others())

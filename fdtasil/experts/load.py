@@ -243,11 +243,11 @@ def _kind_of(source: object) -> "Kind":
 
 
 def _how_to_pass(source: object) -> str:
-    """Return what makes an expert of an object that is none."""
-    if isinstance(getattr(source, "student", None), torch.nn.Module):
+    """Return what makes an expert of an object that is none; no property of it is asked."""
+    if isinstance(getattr(source, "__dict__", {}).get("student"), torch.nn.Module):
         return "of a result, pass its student: result.student"
     for name in _OTHER_NAMES:
-        if callable(getattr(source, name, None)):
+        if callable(getattr(type(source), name, None)):
             return f"pass its method, expert.{name}, if that takes (B, n) and returns (B, m)"
     return (
         "wrap it: lambda observations: ...  ((B, n) -> (B, m)); what remembers has "
