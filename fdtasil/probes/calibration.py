@@ -187,6 +187,7 @@ def calibrate(
     scale = np.where(live, scales.deviation, 0.0)
     normal = random.standard_normal((rays, len(scale))) * live
     directions = scale * normal / np.linalg.norm(normal, axis=1, keepdims=True) * live.sum() ** 0.5
+    directions = scales.with_following(directions)
     signs = np.array([1.0, -1.0])[None, None, :, None]
     moved = directions[:, None, None, :] * radii[None, :, None, None] * signs
     points = (observations[rows][:, None, None, :] + moved).astype(np.float32)

@@ -13,6 +13,7 @@ __all__ = [
     "action_units",
     "least_steps",
     "measure_actions",
+    "measure_following",
     "measure_scales",
 ]
 
@@ -36,6 +37,8 @@ class Scales:
         seen: (n,) bool, whether the student sees the coordinate; others are never probed.
         told: (n,) bool, whether somebody said how far the coordinate will go; it is moved alone
             too.
+        following: (n, n) how far each column goes, of coordinates that the student does not see,
+            with a move of one along each row, of those that it sees; None where none follow.
     """
 
     mean: np.ndarray
@@ -44,6 +47,19 @@ class Scales:
     live: np.ndarray
     seen: np.ndarray
     told: np.ndarray
+    following: np.ndarray | None = None
+
+    @property
+    def followers(self) -> tuple[int, ...]:
+        """Those coordinates that follow others."""
+        led = self.following
+        return () if led is None else tuple(np.flatnonzero(led.any(axis=0)).tolist())
+
+    def with_following(self, moves: np.ndarray) -> np.ndarray:
+        """Return (P, n) moves of the coordinates that are probed, with what follows them."""
+        if self.following is None:
+            return moves
+        return moves + (moves @ self.following).astype(moves.dtype)
 
     @property
     def units(self) -> np.ndarray:
@@ -59,7 +75,7 @@ class Scales:
         live, told = self.live.copy(), self.told.copy()
         deviation[columns] = scale[columns] = values
         live[columns] = told[columns] = True
-        return Scales(self.mean, scale, deviation, live, self.seen, told)
+        return Scales(self.mean, scale, deviation, live, self.seen, told, self.following)
 
     def probed(self, space: str | None) -> np.ndarray:
         """Return (n,) bool, the coordinates that are probed in a space.
@@ -94,6 +110,43 @@ def measure_scales(observations: np.ndarray, seen: np.ndarray | None = None) -> 
     scale = np.where(live, deviation, 1.0)
     visible = np.ones_like(live) if seen is None else seen
     return Scales(mean, scale, deviation, live, visible, np.zeros_like(live))
+
+
+def measure_following(
+    observations: np.ndarray, scales: Scales, hidden: np.ndarray
+) -> np.ndarray | None:
+    """Find the hidden coordinates that others lead along, such as a goal's copy of a position.
+
+    Where a student does not see a number that follows from those that it sees, a move of these
+    alone leads to observations that can't be: its expert would say how it reacts to a
+    contradiction.
+
+    Args:
+        observations: (N, n) states.
+        scales: Of them, with what the student sees.
+        hidden: (n,) bool, which may follow.
+
+    Returns:
+        As in `Scales.following`: linear, of those that the states leave less than a hundredth of
+        their deviation of; None where there are none, or the states are too few to say.
+    """
+    of, to = np.flatnonzero(scales.seen & scales.live), np.flatnonzero(hidden & scales.live)
+    if not len(to) or not len(of) or len(observations) < _STATES_EACH * len(of):
+        return None
+    rows = (observations.astype(np.float64) - scales.mean) / scales.units
+    led, *_ = np.linalg.lstsq(rows[:, of], rows[:, to], rcond=_CONDITION)
+    left = (rows[:, to] - rows[:, of] @ led).std(axis=0)
+    lengths = np.linalg.norm(led, axis=0)
+    follow = (left < _LEFT) & (lengths > 0) & (lengths < _FARTHEST)
+    if not follow.any():
+        return None
+    found = np.zeros((len(hidden), len(hidden)))
+    found[np.ix_(of, to[follow])] = led[:, follow] / scales.units[of][:, None]
+    return found * scales.units
+
+
+_STATES_EACH = 4  # for each coordinate that is looked at: of fewer, anything follows by chance
+_LEFT, _FARTHEST, _CONDITION = 0.01, 2.0, 1e-6  # in deviations
 
 
 def least_steps(rows: np.ndarray) -> np.ndarray:

@@ -48,6 +48,7 @@ class Surroundings:
         step: Length of a direction's step in deviations, over all coordinates.
         ends: The nearest and the farthest that it is stretched to.
         draw: Draws directions in these coordinates.
+        scales: Of the demonstrations; what the student does not see may follow what it sees.
         actions: (N, m) float32 what the expert said at the states; None where that is not known.
     """
 
@@ -59,6 +60,7 @@ class Surroundings:
     step: float
     ends: tuple[float, float]
     draw: Draw
+    scales: Scales
     actions: np.ndarray | None = None
 
     @classmethod
@@ -90,7 +92,8 @@ class Surroundings:
         units = step * deviation
         shown = np.linspace(0, len(observations) - 1, min(len(observations), _SHOWN)).astype(int)
         draw = probes.directions.around(observations[shown][:, live] / units)
-        return cls(observations, probes, live, scales.told[live], units, step, ends, draw)
+        told = scales.told[live]
+        return cls(observations, probes, live, told, units, step, ends, draw, scales)
 
     @property
     def count(self) -> int:
@@ -116,6 +119,7 @@ class Surroundings:
         displacements[:, self.live] = (
             stretch.astype(np.float32) * bank * self.units.astype(np.float32)
         )
+        displacements = self.scales.with_following(displacements)
         gains = len(self.live) ** 0.5 / (self.step * stretch[:, 0])
         # Half of the directions tell of the whole Jacobian, a quarter each of its two parts:
         # weighed so, these are the whole again.

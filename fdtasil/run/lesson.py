@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fdtasil.demonstrations.dataset import Dataset
-from fdtasil.probes.scales import Scales, measure_actions, measure_scales
+from fdtasil.probes.scales import Scales, measure_actions, measure_following, measure_scales
 from fdtasil.probes.spread import Spread
 from fdtasil.rollouts.spaces import Spaces, flat_layout
 from fdtasil.run.checkpoints import Collected
@@ -53,10 +53,12 @@ class Lesson:
         states = collected.dataset.demonstrations
         first = states.observations[states.round == states.round.min()][:256]
         view = View.of(student_obs, first) if before is None else before.view
-        if held:
-            moved = ~np.isin(np.arange(len(view.seen)), list(held))
-            view = replace(view, seen=view.seen & moved)
+        moved = ~np.isin(np.arange(len(view.seen)), list(held))
+        hidden = ~view.seen & moved
+        view = replace(view, seen=view.seen & moved)
         scales = measure_scales(states.observations, view.seen)
+        following = measure_following(states.observations, scales, hidden)
+        scales = replace(scales, following=following)
         told = spread.among(states.observations, states.episode)
         return cls(collected, view, scales.spread_by(told))
 

@@ -100,6 +100,7 @@ def report_of(
         "rows_asked_again_after_resuming": account.again,
         "states": len(lesson.dataset.demonstrations),
         "frozen_coordinates": int((~lesson.scales.live).sum()),
+        "following_coordinates": len(lesson.scales.followers),
         "held": _held(run),
         **{name: lesson.collected.counts.get(name, 0) for name in counts},
         "size": {name: size.to_json() for name, size in sizes.items()},
