@@ -6,6 +6,7 @@ import subprocess
 import sys
 import warnings
 from collections import Counter
+from importlib import import_module
 from itertools import pairwise
 from pathlib import Path
 
@@ -180,6 +181,8 @@ def quick_folder(quick, tmp_path_factory):
 @pytest.fixture(scope="module")
 def no_pictures():
     """Pictures are not drawn: for tests that save many runs and look at other files of them."""
+    # A command that is imported meanwhile would keep what stands in their place.
+    import_module("fdtasil.shell.inspect")
     with pytest.MonkeyPatch.context() as patch:
         for name in ("training", "returns", "calibration"):
             patch.setattr(f"fdtasil.results.figures.draw_{name}", lambda *drawn: b"no picture")

@@ -373,6 +373,12 @@ FAULTS = {
         352: "advice of a single student, where many were interrupted",
         353: "gains of an expert that takes dictionaries",
         354: "a check of a student that sees a part of the observation, or a history",
+        355: "numbers that a student does not see, and that follow from those that it sees",
+        356: "a deviation said of a coordinate that shows a larger one",
+        357: "an action that the expert never uses, beside others that switch",
+        358: "a baseline that is the run itself, or that nobody sees",
+        359: "gains in a shell beside large constants",
+        360: "zips of agents on dictionaries",
     },
 }
 

@@ -124,6 +124,12 @@ def test_a_radius_stays_where_most_states_have_answers():
     assert dict(near.no_answer)[1.0] == 1.0
 
 
+@pytest.mark.fault(357)
+def test_an_action_that_is_never_used_hides_no_switch():
+    assert found_of(lambda x: np.stack([np.sign(x[:, 0]), 0 * x[:, 0]], axis=1)).switches
+    assert not found_of(lambda x: 0 * x[:, :2]).switches
+
+
 def test_a_switch_that_is_answered_nearby_alone_is_not_asked_far_and_wide():
     switch = lambda x: np.sign(x[:, :2])  # noqa: E731
     assert found_of(switch).switches
@@ -136,10 +142,9 @@ def test_a_switch_that_is_answered_nearby_alone_is_not_asked_far_and_wide():
     "law",
     [
         lambda x: np.stack([np.sign(x[:, 0]), np.tanh(x[:, 1])], axis=1),
-        lambda x: np.stack([np.sign(x[:, 0]), 0 * x[:, 0]], axis=1),
         lambda x: np.round(2 * np.tanh(x[:, :2])) / 2,
     ],
-    ids=["one is smooth", "one is still", "five values"],
+    ids=["one is smooth", "five values"],
 )
 def test_a_law_switches_where_each_action_has_two_or_three_values(law):
     assert not found_of(law).switches

@@ -9,6 +9,7 @@ import sys
 from dataclasses import fields
 from importlib import import_module
 
+import gymnasium
 import numpy as np
 import pytest
 import torch
@@ -266,6 +267,39 @@ def test_stored_probes_need_not_be_repeated(linear, inside, tmp_path):
     refused = inside("distill", *short, "--probes", 10, "--out", tmp_path / "other")
     assert refused.returncode == 2
     assert "with stored answers to 'sphere:5," in refused.stderr
+
+
+@pytest.mark.fault(358)
+@pytest.mark.parametrize("idle", [["--probes", "0"], ["--evaluation-episodes", "0"]])
+def test_a_baseline_that_nobody_compares_is_refused(idle, expert, inside, tmp_path):
+    line = ["distill", expert, TOY, "--episodes", "2", "--baseline", *idle]
+    done = inside(*line, "--out", tmp_path / "run")
+    assert done.returncode == 2
+    assert f"--baseline beside {' '.join(idle)}" in done.stderr
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_folder_without_a_name_has_one(expert, inside, tmp_path):
+    assert inside("distill", expert, TOY, *QUICK, "--out", tmp_path / "run").returncode == 0
+    for name, cwd in ((".", tmp_path / "run"), ("..", tmp_path / "run" / "figures")):
+        inside("report", name, cwd=cwd)
+        assert (tmp_path / "run.html").exists()
+        (tmp_path / "run.html").unlink()
+
+
+@pytest.mark.fault(359)
+def test_gains_beside_a_large_constant(expert, inside):
+    class Offset(gymnasium.ObservationWrapper):
+        def observation(self, observation):
+            return observation + np.array([0, 0, 0, 0, 5e6])
+
+    gymnasium.register("toy/Offset-v0", entry_point=lambda: Offset(gymnasium.make(TOY)))
+    try:
+        shown = inside("gains", expert, "toy/Offset-v0", "--states", 3, "--horizon", 20)
+    finally:
+        del gymnasium.registry["toy/Offset-v0"]
+    assert shown.returncode == 0, shown.stderr
+    assert "still      4" in shown.stdout
 
 
 # --- errors

@@ -41,6 +41,7 @@ def distilled(probes, **given):
     return fdtasil.distill(law, Copied, probes, student_obs=SEEN, **quick)
 
 
+@pytest.mark.fault(355)
 @pytest.mark.parametrize(
     "probes", ["sphere:4,forward", "adaptive:4,central", "basis", "orthogonal:3", "fresh"]
 )

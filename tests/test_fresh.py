@@ -540,6 +540,19 @@ def test_a_weight_of_nothing_is_warned_of(expert):
     run = {**QUICK, "fit": Fit(steps=20, moved_weight=2)}
     with pytest.warns(FdtasilWarning, match="moved_weight=2 weighs nothing"):
         fdtasil.distill(expert, TOY, "3,differences", **run)
+    run = {**QUICK, "fit": Fit(steps=20, curvature_weight=3)}
+    with pytest.warns(FdtasilWarning, match="curvature_weight=3 weighs nothing without order=2"):
+        fdtasil.distill(expert, TOY, 3, **run)
+
+
+@pytest.mark.fault(356)
+def test_less_than_what_a_coordinate_shows_is_not_taken():
+    with pytest.warns(FdtasilWarning, match=r"spread=\{0: 0\.001\} is less than"):
+        narrow = fdtasil.distill(linear, TOY, 3, spread={0: 0.001}, **QUICK)
+    told = fdtasil.distill(linear, TOY, 3, spread={0: 0.5}, **QUICK)
+    own = narrow.dataset.demonstrations.observations[:, 0].std()
+    assert narrow.student.scale[0].item() == pytest.approx(own, rel=1e-5)
+    assert told.student.scale[0].item() == pytest.approx(max(own, 0.5), rel=1e-5)
 
 
 @pytest.mark.fault(241)

@@ -243,11 +243,11 @@ def _resolved(steps: np.ndarray, wanted: np.ndarray, scale: np.ndarray) -> int:
 
 
 def _switches(values: np.ndarray, centres: np.ndarray) -> bool:
-    """Whether each of the actions in (rays, radii, 2, m) values has few of them."""
+    """Whether each of the actions in (rays, radii, 2, m) values that changes has few of them."""
     m = centres.shape[1]
     said = np.concatenate([values.reshape(-1, m), centres])
     counts = [len(np.unique(action)) for action in said.T]
-    return max(counts) <= _FEW_VALUES and min(counts) > 1
+    return 1 < max(counts) <= _FEW_VALUES
 
 
 _LOST = 0.5  # share of a step that is rounding; with it, differences still agree to 0.8

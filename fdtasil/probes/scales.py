@@ -67,13 +67,15 @@ class Scales:
         return np.where(self.live, self.deviation, 1.0)
 
     def spread_by(self, deviations: Mapping[int, float]) -> "Scales":
-        """Return the scales with coordinates that are said to vary by other deviations."""
+        """Return the scales with coordinates that are said to go farther than was seen."""
         if not deviations:
             return self
         columns, values = list(deviations), list(deviations.values())
         deviation, scale = self.deviation.copy(), self.scale.copy()
         live, told = self.live.copy(), self.told.copy()
-        deviation[columns] = scale[columns] = values
+        # Less than what was seen is a mistake, and would blow up what the student is shown.
+        seen = np.where(live, deviation, 0.0)[columns]
+        deviation[columns] = scale[columns] = np.maximum(values, seen)
         live[columns] = told[columns] = True
         return Scales(self.mean, scale, deviation, live, self.seen, told, self.following)
 

@@ -19,6 +19,7 @@ __all__ = [
     "warn_of_falls",
     "warn_of_idle_weights",
     "warn_of_misfit",
+    "warn_of_narrow_spread",
     "warn_of_one_state",
     "warn_of_rounded_movement",
     "warn_of_silence",
@@ -33,6 +34,7 @@ _MISFIT = 0.15  # share of the actions' deviation; students of the experts here 
 _RAISED = "; each row of a batch that raises is asked again, alone: a row of NaN costs no query"
 _CHOICES = 20  # values that a mode has at most
 _SELDOM = 0.05  # of the states: what is met in fewer is an exception
+_NARROW = 0.5  # of a coordinate's own deviation
 _SHOWN = 8  # coordinates named in a warning
 _CLEARLY = 4  # of float32's steps, that rounding does not move a coordinate by
 _SMALL = 1e-4  # of the median deviation; robots' observations differ by less
@@ -81,6 +83,9 @@ def warn_of_idle_weights(
         value = getattr(given, name)
         if not does and value != getattr(usual, name):
             warn(f"{name}={value:g} weighs nothing: {source.describe()!r} matches {matched}")
+    curvature, unsaid = given.curvature_weight, (usual.curvature_weight, Fit().curvature_weight)
+    if given.order == 1 and curvature not in unsaid:
+        warn(f"curvature_weight={curvature:g} weighs nothing without order=2")
 
 
 def warn_of_silence(shares: Mapping[str, float], reason: str, given_up: int) -> None:
@@ -147,6 +152,23 @@ def warn_of_small_units(scales: Scales) -> None:
             f"{len(found)} coordinates deviate by less than a ten-thousandth of what others do "
             f"({told}{more}): that is taken for their units; of one that only stands nearly still "
             "here, spread={coordinate: deviation} says how far it will go"
+        )
+
+
+def warn_of_narrow_spread(told: Mapping[int, float], scales: Scales) -> None:
+    """Warn of coordinates that go farther in the demonstrations than somebody said they will.
+
+    Args:
+        told: Deviations by coordinate.
+        scales: Of all states.
+    """
+    found = [i for i, said in told.items() if said < _NARROW * scales.deviation[i]]
+    if found:
+        first = found[0]
+        warn(
+            f"spread={{{first}: {told[first]:g}}} is less than what the coordinate shows in the "
+            f"demonstrations, a deviation of {scales.deviation[first]:.2g}, which is taken: is it "
+            "the right one?"
         )
 
 

@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from fdtasil.checks import check_count
@@ -103,7 +104,10 @@ def _calibrated(looked: Looked, pool: EnvironmentPool, seed: int) -> Calibration
     if looked.own is None or looked.expert is None:
         return None
     visited, random = looked.own.observations[looked.own.valid], generator(seed, "calibration")
-    scales, radius = measure_scales(visited), PRESETS["standard"].radius
+    moved = ~np.isin(np.arange(visited.shape[1]), list(pool.spaces.observations.held))
+    if not moved.any():
+        return None
+    scales, radius = measure_scales(visited, moved), PRESETS["standard"].radius
     low, high, choices = pool.boxes.low, pool.boxes.high, pool.spaces.actions.choices
     units = action_units(low, high, looked.own.actions[looked.own.valid], choices)
     return calibrate(looked.expert, visited, scales, random, radius, units=units)

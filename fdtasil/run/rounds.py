@@ -25,6 +25,7 @@ from fdtasil.run.collecting import Collecting
 from fdtasil.run.configuration import Configuration
 from fdtasil.run.doubts import (
     warn_of_falls,
+    warn_of_narrow_spread,
     warn_of_one_state,
     warn_of_rounded_movement,
     warn_of_small_units,
@@ -91,6 +92,8 @@ class Rounds:
             warn_of_one_state(lesson.dataset.demonstrations)
             warn_of_small_units(lesson.scales)
             warn_of_rounded_movement(lesson)
+            if not self.run.spread.where_still:
+                warn_of_narrow_spread(self.run.spread.deviations, lesson.scales)
         if expert is not None and round_ == 0 and self.collecting is not None:
             warn_of_falls(lesson.dataset.demonstrations, expert, self.run.keep)
         if last and self.run.can_spread:

@@ -1,5 +1,6 @@
 """A call of `distill` from the flat arguments of a shell."""
 
+import os
 from collections.abc import Mapping
 from dataclasses import fields
 from pathlib import Path
@@ -22,6 +23,7 @@ __all__ = [
     "ENVIRONMENT_FLAGS",
     "EXPERT_FLAGS",
     "MADE_FLAGS",
+    "beside_run",
     "distil",
     "judged",
     "opened",
@@ -99,6 +101,12 @@ def opened_in(
     place = wanted(env, *(arguments.pop(name) for name in made))
     how = {name: arguments.pop(name) for name in ("output", "inputs", "trust")}
     return opened(arguments.pop("expert"), place, **how), place
+
+
+def beside_run(run: Path, ending: str) -> Path:
+    """Return what is named after a run's folder, and lies beside it; "." and ".." have names."""
+    named = run if run.name not in ("", "..") else Path(os.path.abspath(run))
+    return named.with_name(f"{named.name}{ending}")
 
 
 def distil(arguments: Arguments, *, progress: bool = True) -> Distilled:

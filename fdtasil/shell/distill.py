@@ -64,6 +64,8 @@ def _distill(baseline: bool, json: Path | None, **arguments: Any) -> None:
     # Absolute from the beginning: an environment may change the working folder.
     folder = out.absolute()
     place = {"out": folder} if resume is None else {"out": None, "resume": folder}
+    if baseline:
+        _check_baseline(arguments)
     plainly = {**arguments, "probes": 0, "out": None, "resume": None, "log_formats": ()}
     with evaluated_beside(plainly if baseline else None) as cloning:
         if resume is None:
@@ -100,6 +102,22 @@ class _Outcome:
                 f"saved in {self.out}: student.onnx, student.safetensors, report.json, "
                 "figures/, ...",
             ]
+        )
+
+
+def _check_baseline(arguments: dict[str, Any]) -> None:
+    """Refuse a baseline that is the run itself, or that nobody would see.
+
+    Raises:
+        SettingError: If it is one.
+    """
+    cloned, unseen = arguments["probes"] == "0", arguments["evaluation_episodes"] == 0
+    if cloned or unseen:
+        with_it = "--probes 0, which clones plainly" if cloned else "--evaluation-episodes 0"
+        raise SettingError(
+            f"--baseline beside {with_it}",
+            "a run with probes that is judged, for the baseline to be compared with",
+            "leave --baseline out",
         )
 
 
@@ -292,7 +310,8 @@ command = as_command(
         "baseline": (
             bool,
             False,
-            "Also clone plainly, without probes, in a process beside it, and show both.",
+            "Also clone plainly, without probes, in a process beside it, and show both. It asks "
+            "the expert too, up to --max-queries of its own.",
         ),
         **JSON_FLAG,
     },

@@ -6,6 +6,7 @@ from fdtasil.checks import check_suffix
 from fdtasil.files.storage import write_bytes
 from fdtasil.results.distilled import Distilled
 from fdtasil.results.page import page_of
+from fdtasil.shell.call import beside_run
 from fdtasil.shell.command import RunFolder
 
 __all__ = ["command"]
@@ -18,6 +19,6 @@ def command(run: RunFolder, /, *, out: Path | None = None) -> None:
         run: Folder of a finished run.
         out: Where; left out, RUN.html beside the folder.
     """
-    file = run.parent / f"{run.name}.html" if out is None else check_suffix(out, ".html")
+    file = beside_run(run, ".html") if out is None else check_suffix(out, ".html")
     write_bytes(file, page_of(Distilled.load(run)).encode())
     print(f"written: {file}")

@@ -7,7 +7,7 @@ from typing import Any
 
 from fdtasil.results.distilled import Distilled
 from fdtasil.run.shrinking import LADDER, fit_of, shrink
-from fdtasil.shell.call import EXPERT_FLAGS, MADE_FLAGS, opened_in
+from fdtasil.shell.call import EXPERT_FLAGS, MADE_FLAGS, beside_run, opened_in
 from fdtasil.shell.command import (
     EnvironmentId,
     ExpertPath,
@@ -29,7 +29,7 @@ def _shrink(
     steps: int | None,
     **arguments: Any,
 ) -> None:
-    place_of_runs = run.parent / f"{run.name}-shrunk" if out is None else out
+    place_of_runs = beside_run(run, "-shrunk") if out is None else out
     asked, place = opened_in(arguments)
     result = Distilled.load(run)
     found = shrink(

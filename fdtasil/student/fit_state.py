@@ -69,7 +69,8 @@ class FitState:
         raise FitError(
             found,
             "finite numbers",
-            "lower learning_rate, or check the expert's answers for outliers",
+            "begin another run with a lower learning_rate, or check the expert's answers for "
+            "outliers",
         )
 
     def _finite_weights(self) -> bool:
