@@ -379,6 +379,7 @@ FAULTS = {
         358: "a baseline that is the run itself, or that nobody sees",
         359: "gains in a shell beside large constants",
         360: "zips of agents on dictionaries",
+        361: "gains at a single state of few coordinates",
     },
 }
 

@@ -74,6 +74,17 @@ def test_the_error_of_a_law_that_bends_nowhere_is_that_of_its_noise(seed):
     assert 0.75 < np.linalg.norm(found.error * found.scale) / apart < 1.35
 
 
+@pytest.mark.fault(361)
+def test_one_state_of_one_coordinate_has_its_derivative_and_an_honest_error():
+    """All rays are the same two points there, and some answers agree to the bit by luck."""
+    for place in np.random.default_rng(0).uniform(-1, 1, 40):
+        found = gains(np.sin, np.array([[place]]))
+        apart = abs(found.jacobian.item() / np.cos(np.float32(place)) - 1)
+        assert apart < 1e-4
+        assert 0 < found.relative_error < 1e-3
+        assert apart < 5 * found.relative_error
+
+
 def test_a_linear_expert_is_exact_and_a_single_state_is_enough():
     gain = np.random.default_rng(2).standard_normal((2, 4)).astype(np.float32)
     found = gains(lambda rows: rows @ gain.T, np.zeros((1, 4)))

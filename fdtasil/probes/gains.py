@@ -236,7 +236,10 @@ def _law(
     axes = random.integers(rows.shape[1], size=_RAYS)
     steps = np.zeros_like(states, np.float64)
     steps[np.arange(_RAYS), axes] = units[axes]
-    slopes = np.stack([_slope(expert, states, steps * rung) / rung for rung in _RUNGS])
+    asked = [_slope(expert, states, steps * rung) for rung in _RUNGS]
+    slopes = np.stack([found / rung for (found, _), rung in zip(asked, _RUNGS, strict=True)])
+    # Answers are rounded themselves: of few rays, some agree to the bit by luck.
+    rounded = _ROUNDING / 24**0.5 * np.sqrt(np.nanmean([size for _, size in asked], axis=0))
     first = [_moves(states, steps * rung) for rung in _RUNGS].index(True)
     slopes, rungs = slopes[first:], _RUNGS[first:]
     apart = np.nanmean(np.diff(slopes, axis=0) ** 2, axis=1)  # (rungs - 1, m)
@@ -249,7 +252,8 @@ def _law(
         if not told.any():
             continue
         # Differences that agree to the bit agree to float32's rounding, and no better.
-        squares = np.maximum(squares, np.where(told, size, 1) * _ROUNDING**2)
+        least = np.where(told, size, 1) * _ROUNDING**2 + law[:, 0] * rounded[action] ** 2
+        squares = np.maximum(squares, least)
         best = int(np.where(told, squares / np.where(told, size, 1), np.inf).argmin())
         window = np.arange(max(0, best - _WINDOW), min(len(squares), best + 2))
         window = window[told[window]]
@@ -287,7 +291,8 @@ def _best_radius(noise: np.ndarray, curvature: np.ndarray, nearest: float) -> fl
 def _jacobian(expert: Expert, rows: np.ndarray, steps: np.ndarray) -> np.ndarray:
     """Return (N, m, n) central differences along each coordinate."""
     count, n = rows.shape
-    slopes = _slope(expert, *_along_each(rows, steps)) / steps[np.tile(np.arange(n), count), None]
+    found, _ = _slope(expert, *_along_each(rows, steps))
+    slopes = found / steps[np.tile(np.arange(n), count), None]
     return slopes.reshape(count, n, -1).transpose(0, 2, 1)
 
 
@@ -308,11 +313,15 @@ def _moves(states: np.ndarray, steps: np.ndarray) -> bool:
     return bool((ahead != behind).any(axis=1).all())
 
 
-def _slope(expert: Expert, states: np.ndarray, steps: np.ndarray) -> np.ndarray:
-    """Return (R, m) changes for each whole step, over the distance that float32 really moves."""
+def _slope(expert: Expert, states: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Return (R, m) changes for each whole step, over the distance that float32 really moves.
+
+    Beside them the (m,) mean squares of the answers.
+    """
     ahead, behind = _ends(states, steps)
     lengths = np.linalg.norm(ahead.astype(np.float64) - behind, axis=1)
     shares = lengths / np.linalg.norm(steps, axis=1)
     answers = expert.ask(np.concatenate([ahead, behind]), "probe").astype(np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):  # a step that float32 rounds away
-        return (answers[: len(states)] - answers[len(states) :]) / shares[:, None]
+        changes = (answers[: len(states)] - answers[len(states) :]) / shares[:, None]
+    return changes, np.nanmean(answers**2, axis=0)
