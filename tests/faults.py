@@ -380,6 +380,7 @@ FAULTS = {
         359: "gains in a shell beside large constants",
         360: "zips of agents on dictionaries",
         361: "gains at a single state of few coordinates",
+        362: "a curved view, or second derivatives that nobody gives, found after all was asked",
     },
 }
 

@@ -849,3 +849,21 @@ def test_functions_are_tried_before_the_expert_is_asked(changes, said):
     with pytest.raises(SettingError, match=said):
         fdtasil.distill(law, lambda: InForm("dictionary"), 2, **QUICK, **changes)
     assert sum(asked) == 0
+
+
+@pytest.mark.fault(362)
+@pytest.mark.parametrize(("probes", "order"), [("3,central", 1), (3, 2)])
+def test_a_curved_view_is_refused_before_anybody_is_asked(probes, order, linear):
+    asked = []
+
+    def counted(rows):
+        asked.append(len(rows))
+        return linear(rows)
+
+    run = {**QUICK, "fit": fdtasil.Fit(steps=5, order=order)}
+    with pytest.raises(SettingError, match="a curved function"):
+        fdtasil.distill(counted, TOY, probes, student_obs=lambda rows: rows**2, **run)
+    refused = sum(asked)
+    asked.clear()
+    whole = fdtasil.distill(counted, TOY, probes, **run)
+    assert refused <= sum(asked) - whole.queries["probe"]

@@ -178,7 +178,7 @@ def test_derivatives_of_something_else_are_named():
         )
     with pytest.raises(ExpertError, match="gives derivatives that are not finite"):
         fdtasil.distill(lambda rows: sensitive(rows, sign=np.nan), TOY, **run)
-    with pytest.raises(ExpertError, match="differentiated twice"):
+    with pytest.raises(SettingError, match="gives itself"):
         fdtasil.distill(sensitive, TOY, **{**run, "fit": fdtasil.Fit(steps=40, order=2)})
 
 

@@ -144,6 +144,7 @@ class Arguments:
         given, source, expert = self.given, self.probes, subject.expert
         stored = given is not None and given.answers is not None
         calibrates = source is not None and self.preset.calibrates(source)
+        exact = source is not None and source.exact
         horizon = resolve_horizon(self.horizon, subject.pool) if subject.pool else 0
         (start,) = episode_seeds(self.seed, "evaluation", 0, 1)
         return Configuration(
@@ -160,7 +161,7 @@ class Arguments:
             observation_size=subject.observation_size,
             past=subject.past,
             remembered=subject.remembered,
-            own_derivatives=source is not None and source.exact and _gives_derivatives(expert),
+            own_derivatives=exact and _gives_derivatives(expert, self.fit.order),
             student_obs=describe_view(self.student_obs, subject.observation_size),
             student=self.student or usual_architecture(anew=bool(source and source.resample)),
             fit=self.fit,
@@ -244,8 +245,21 @@ def read_arguments(
     )
 
 
-def _gives_derivatives(expert: Expert | None) -> bool:
-    return expert is not None and expert.module is None and expert.jacobian is not None
+def _gives_derivatives(expert: Expert | None, order: int) -> bool:
+    """Whether an expert without a module gives its derivatives.
+
+    Raises:
+        SettingError: If second ones are asked for, which it does not give.
+    """
+    if expert is None or expert.module is not None or expert.jacobian is None:
+        return False
+    if order > 1:
+        raise SettingError(
+            f"order={order} with the derivatives that {expert.name} gives itself",
+            "a torch module, or probes that ask for differences",
+            'write order=1, or probes="10,central"',
+        )
+    return True
 
 
 def _checked_keep(keep: str, given: Dataset | None) -> str:

@@ -9,6 +9,7 @@ import numpy as np
 from fdtasil.demonstrations.dataset import Dataset
 from fdtasil.demonstrations.states import Demonstrations
 from fdtasil.probes.answers import Answers, Beginning
+from fdtasil.probes.surroundings import Surroundings
 from fdtasil.rollouts.behaviours import Policy
 from fdtasil.rollouts.episodes import Episodes
 from fdtasil.run.checkpoints import (
@@ -35,9 +36,12 @@ from fdtasil.run.doubts import (
 from fdtasil.run.events import Event
 from fdtasil.run.lesson import Lesson
 from fdtasil.run.training import Training
-from fdtasil.student.view import StudentObservation
+from fdtasil.seeding import generator
+from fdtasil.student.view import StudentObservation, View
 
 __all__ = ["Rounds"]
+
+_FEW = 32  # states that a view is tried on
 
 
 @dataclass(frozen=True)
@@ -174,6 +178,20 @@ class Rounds:
         source = self.checkpoints.asking.source
         return replace(new, dataset=replace(new.dataset, probes=source, answers=answers))
 
+    def _try_view(self, around: Surroundings, view: View) -> None:
+        """Refuse a curved view before anybody is asked around the states.
+
+        Raises:
+            SettingError: As `View.answers`.
+        """
+        source = self.checkpoints.asking.source
+        if view.columns is not None or view.is_whole or source is None:
+            return
+        few = replace(around, observations=around.observations[:_FEW])
+        drawn = few.sample(generator(self.run.seed, "view"))
+        offsets = source.stencil.offsets if source.stencil else ()
+        view.steps(few.observations, drawn.displacements[drawn.numbers], offsets)
+
     def _answers(self, round_: int, states: Demonstrations, lesson: Lesson) -> Answers:
         """Ask the probes around a round's states; the answers are kept on the way."""
         known = self.checkpoints.take_up(round_, ASKED)
@@ -181,6 +199,8 @@ class Rounds:
         asking.calibrate(lesson.dataset, lesson.scales)
         # What there is to warn of was said before the first answer.
         around = asking.around(states, lesson.scales, again=known is not None)
+        if known is None:
+            self._try_view(around, lesson.view)
         with self.training.progress.bar("probes", "state", len(states)) as bar:
 
             def told(values: np.ndarray, states: int) -> None:

@@ -150,7 +150,19 @@ class View:
             return replace(whole, displacements=bank)
         if self.is_whole:
             return whole
-        centres, moved = self.look(states), whole.displacements[whole.numbers]
+        bank = self.steps(states, whole.displacements[whole.numbers], offsets)
+        bank = bank.reshape(-1, self.size).astype(np.float32)
+        numbers = np.arange(len(bank), dtype=np.int32).reshape(whole.numbers.shape)
+        gains = whole.gains[whole.numbers].reshape(-1)
+        return Answers(bank, numbers, whole.values, gains)
+
+    def steps(self, states: np.ndarray, moved: np.ndarray, offsets: Sequence[float]) -> np.ndarray:
+        """Return (N, k, size) steps of the view of (N, n) states that are moved by (N, k, n).
+
+        Raises:
+            SettingError: As `answers`.
+        """
+        centres = self.look(states)
         # Exact derivatives have no offsets: a view that is linear keeps them too.
         sides = offsets or (1.0, -1.0)
         steps = [self._step(states, centres, offset * moved) / offset for offset in sides]
@@ -161,10 +173,7 @@ class View:
                 "a linear function, indices, or the forward stencil",
                 'write for example probes="sphere:10,forward"',
             )
-        bank = steps[0].reshape(-1, self.size).astype(np.float32)
-        numbers = np.arange(len(bank), dtype=np.int32).reshape(whole.numbers.shape)
-        gains = whole.gains[whole.numbers].reshape(-1)
-        return Answers(bank, numbers, whole.values, gains)
+        return steps[0]
 
     def _step(self, states: np.ndarray, centres: np.ndarray, moved: np.ndarray) -> np.ndarray:
         points = states[:, None, :] + moved
