@@ -79,7 +79,7 @@ def run(cell: Cell, device: str) -> dict[str, Any]:
             # The library's term is the size of z'Hz for z uniform on the sphere of radius sqrt(n),
             # about sqrt(2) times the Frobenius norm of H where n is 10 (never below 1.29 times;
             # 1.5 for the difference of two experts): this is about the paper's 10.
-            curvature_weight=10.0 / 2**0.5,
+            curvature_weight=10.0 / 2**0.5 if order == 2 else None,
         ),
         student=fdtasil.Mlp((64, 64, 64)),
         episodes=DEMONSTRATIONS,

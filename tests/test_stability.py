@@ -101,8 +101,10 @@ def test_what_a_diagnosis_measures_of_it_is_the_formula(nu):
     law = found.law
     assert law.exponent == pytest.approx(nu, rel=0.02)
     assert law.constant == pytest.approx(reach, rel=0.1)
-    # At nu = 1/2 order 1 has a theorem just above, and none at it.
-    assert str(law).endswith({0.5: "for: 1 to 2", 1.0: "for: 1", 2.0: "for: 0"}[nu])
+    # Just above 1/2 order 1 has a theorem, and just above 1 order 0: on which side of such an end
+    # an exponent and its interval lie, rounding decides, otherwise on other processors.
+    ends = {0.5: ("1", "1 to 2"), 1.0: ("1", "0 to 1"), 2.0: ("0",)}
+    assert str(law).partition("ask for: ")[2] in ends[nu]
 
 
 @pytest.mark.slow
