@@ -63,12 +63,18 @@ def test_where_it_runs_it_keeps_its_own_past(file, tmp_path):
     rewards = 0.0
     for seed in fdtasil.seeding.episode_seeds(0, "evaluation", 0, 2):
         observation, _ = environment.reset(seed=seed)
+        began = observation
         for step in range(20):
             action, _ = policy.predict(observation, episode_start=step == 0)
             observation, reward, terminated, *_ = environment.step(action)
             rewards += reward
             if terminated:
                 break
+        carried = policy.predict(began)[0]
+        policy.reset()
+        anew = policy.predict(began)[0]
+        assert np.array_equal(anew, policy.predict(began, episode_start=True)[0])
+        assert not np.array_equal(anew, carried)
     assert rewards / 2 == pytest.approx(result.evaluation.student_return, rel=1e-3)
     path = result.to_onnx(tmp_path / "s.onnx")
     again = fdtasil.evaluate(path, file, TOY, episodes=2, horizon=20, history=H, progress=False)

@@ -176,7 +176,10 @@ def _advice(answer: np.ndarray, rows: int, action_size: int | None) -> str:
     if answer.ndim < 2 and answer.size and np.isnan(answer).all():
         return "in the place of None, return a row of NaN for each row that has no answer"
     if answer.shape == (rows,) and action_size in (None, 1):
-        return "of one action, return found[:, None]: a row for each row of observations"
+        return (
+            "of one action, return found[:, None], a row for each row of observations; of an "
+            "object, pass lambda rows: model.predict(rows)[:, None]"
+        )
     return "return one row of actions for each row of observations"
 
 

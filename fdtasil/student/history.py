@@ -48,6 +48,10 @@ class History:
         self._student, self._history = student, history
         self._window = Window(history, self.observation_size, m)
 
+    def reset(self) -> None:
+        """Forget what was seen, before an episode begins."""
+        self._window.clear()
+
     def predict(
         self,
         observation: np.ndarray,
@@ -77,7 +81,7 @@ class History:
                 "make the vector environment with n_envs=1",
             )
         if np.any(episode_start):
-            self._window.clear()
+            self.reset()
         n = self.observation_size
         step = "pass result.dataset.spaces.observations.row(observation)"
         seen = as_numbers(observation, f"({n},), its flat form", step)
