@@ -239,7 +239,7 @@ def _law(
     asked = [_slope(expert, states, steps * rung) for rung in _RUNGS]
     slopes = np.stack([found / rung for (found, _), rung in zip(asked, _RUNGS, strict=True)])
     # Answers are rounded themselves: of few rays, some agree to the bit by luck.
-    rounded = _ROUNDING / 24**0.5 * np.sqrt(np.nanmean([size for _, size in asked], axis=0))
+    rounded = _ROUNDING / 24**0.5 * np.sqrt(np.mean([size for _, size in asked], axis=0))
     first = [_moves(states, steps * rung) for rung in _RUNGS].index(True)
     slopes, rungs = slopes[first:], _RUNGS[first:]
     apart = np.nanmean(np.diff(slopes, axis=0) ** 2, axis=1)  # (rungs - 1, m)
@@ -324,4 +324,5 @@ def _slope(expert: Expert, states: np.ndarray, steps: np.ndarray) -> tuple[np.nd
     answers = expert.ask(np.concatenate([ahead, behind]), "probe").astype(np.float64)
     with np.errstate(divide="ignore", invalid="ignore"):  # a step that float32 rounds away
         changes = (answers[: len(states)] - answers[len(states) :]) / shares[:, None]
-    return changes, np.nanmean(answers**2, axis=0)
+    heard = (~np.isnan(answers)).sum(axis=0)  # none, where nobody answers
+    return changes, np.nansum(answers**2, axis=0) / np.maximum(heard, 1)
