@@ -8,7 +8,7 @@ import torch
 from fdtasil.errors import ExpertError, in_one_line
 from fdtasil.experts.expert import Expert
 from fdtasil.probes.gains import gain_rows, gains
-from fdtasil.probes.scales import least_steps, measure_scales
+from fdtasil.probes.scales import measure_scales
 
 __all__ = ["check_derivatives", "comparison_rows", "differentiate"]
 
@@ -165,7 +165,7 @@ def check_derivatives(expert: Expert, observations: np.ndarray) -> None:
         return
     chosen = np.linspace(0, len(observations) - 1, _COMPARED).astype(int)
     rows = observations[chosen]
-    scale = np.maximum(measure_scales(observations).units, least_steps(rows))
+    scale = measure_scales(observations).units_beside(rows)
     given, found = _jacobians(expert, rows), gains(expert, rows, scale=scale)
     expert.count(found.queries, "probe")
     apart = np.sqrt(np.nanmean(((given - found.jacobian) * scale) ** 2, axis=0))

@@ -204,9 +204,9 @@ def _still(rows: np.ndarray) -> tuple[int, ...]:
 
 
 def _units(rows: np.ndarray, scale: np.ndarray | None) -> np.ndarray:
-    least = least_steps(rows)
     if scale is None:
-        return np.maximum(measure_scales(rows).units, least)
+        return measure_scales(rows).units_beside(rows)
+    least = least_steps(rows)
     units = np.asarray(scale, np.float64)
     if units.shape != rows.shape[1:] or not (np.isfinite(units) & (units > 0)).all():
         found = f"scale of shape {units.shape}, from {units.min(initial=0):g}"

@@ -11,6 +11,7 @@ __all__ = [
     "ROUNDING",
     "Scales",
     "action_units",
+    "all_but",
     "least_steps",
     "measure_actions",
     "measure_following",
@@ -65,6 +66,10 @@ class Scales:
     def units(self) -> np.ndarray:
         """(n,) the deviation of each coordinate; 1 for those that do not move."""
         return np.where(self.live, self.deviation, 1.0)
+
+    def units_beside(self, rows: np.ndarray) -> np.ndarray:
+        """Return `units`, none of them so small that float32 rounds it away beside (N, n) rows."""
+        return np.maximum(self.units, least_steps(rows))
 
     def spread_by(self, deviations: Mapping[int, float]) -> "Scales":
         """Return the scales with coordinates that are said to go farther than was seen."""
@@ -149,6 +154,11 @@ def measure_following(
 
 _STATES_EACH = 4  # for each coordinate that is looked at: of fewer, anything follows by chance
 _LEFT, _FARTHEST, _CONDITION = 0.01, 2.0, 1e-6  # in deviations
+
+
+def all_but(held: Iterable[int], n: int) -> np.ndarray:
+    """Return (n,) bool, the coordinates that are not among those held."""
+    return ~np.isin(np.arange(n), list(held))
 
 
 def least_steps(rows: np.ndarray) -> np.ndarray:

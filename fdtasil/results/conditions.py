@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fdtasil.probes.scales import Scales
+from fdtasil.probes.scales import Scales, all_but
 from fdtasil.results.stability import NEARLY, Law
 from fdtasil.rollouts.behaviours import Policy
 
@@ -139,7 +139,7 @@ def errors_of(
         no coordinate can be probed, or more than 1,000. Infinite errors where the student has no
         answer.
     """
-    probed = scales.probed("whitened") & ~np.isin(np.arange(states.shape[1]), list(held))
+    probed = scales.probed("whitened") & all_but(held, states.shape[1])
     if not 0 < probed.sum() <= _MOST:
         return None
     axes = np.eye(len(probed))[probed][:, None]

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from fdtasil.probes.scales import Scales, least_steps
+from fdtasil.probes.scales import Scales, all_but, least_steps
 from fdtasil.rollouts.behaviours import Policy, has_none
 
 __all__ = ["GOOD", "USUAL", "Fidelity", "fidelity_of"]
@@ -73,7 +73,7 @@ def fidelity_of(
         random: Draws directions that nothing was trained on.
         held: Coordinates that nothing moves: choices, flags, whole numbers. Not all of them.
     """
-    live = scales.probed("whitened") & ~np.isin(np.arange(states.shape[1]), list(held))
+    live = scales.probed("whitened") & all_but(held, states.shape[1])
     count, n = states.shape
     normal = random.standard_normal((count, _DIRECTIONS, n)) * live
     unit = normal / np.linalg.norm(normal, axis=2, keepdims=True) * live.sum() ** 0.5

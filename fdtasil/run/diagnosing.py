@@ -15,7 +15,7 @@ from fdtasil.experts.examination import examine
 from fdtasil.experts.expert import Expert
 from fdtasil.experts.load import ExpertLike, expert_in
 from fdtasil.probes.calibration import calibrate
-from fdtasil.probes.scales import Scales, action_units, measure_scales
+from fdtasil.probes.scales import Scales, action_units, all_but, measure_scales
 from fdtasil.progress import Progress
 from fdtasil.results.conditions import conditions_of, errors_of
 from fdtasil.results.diagnosis import Diagnosis
@@ -234,7 +234,7 @@ class _Pair:
     def _regime(self, own: Episodes) -> str | None:
         """Return how the expert answers; None where it does not, or always the same."""
         visited = own.observations[own.valid]
-        moved = self.scales.live & ~np.isin(np.arange(visited.shape[1]), list(self._held))
+        moved = self.scales.live & all_but(self._held, visited.shape[1])
         about = measure_scales(visited, moved), generator(self.seed, "calibration")
         with suppress(ExpertError):
             found = calibrate(

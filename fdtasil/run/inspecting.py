@@ -2,7 +2,6 @@
 
 from pathlib import Path
 
-import numpy as np
 import torch
 
 from fdtasil.checks import check_count
@@ -11,7 +10,7 @@ from fdtasil.errors import without_secrets
 from fdtasil.experts.examination import Looked, look_closely
 from fdtasil.experts.load import ExpertLike
 from fdtasil.probes.calibration import Calibration, calibrate
-from fdtasil.probes.scales import action_units, measure_scales
+from fdtasil.probes.scales import action_units, all_but, measure_scales
 from fdtasil.results.inspection import Inspection
 from fdtasil.rollouts.environments import (
     EnvironmentLike,
@@ -104,7 +103,7 @@ def _calibrated(looked: Looked, pool: EnvironmentPool, seed: int) -> Calibration
     if looked.own is None or looked.expert is None:
         return None
     visited, random = looked.own.observations[looked.own.valid], generator(seed, "calibration")
-    moved = ~np.isin(np.arange(visited.shape[1]), list(pool.spaces.observations.held))
+    moved = all_but(pool.spaces.observations.held, visited.shape[1])
     if not moved.any():
         return None
     scales, radius = measure_scales(visited, moved), PRESETS["standard"].radius

@@ -6,7 +6,13 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fdtasil.demonstrations.dataset import Dataset
-from fdtasil.probes.scales import Scales, measure_actions, measure_following, measure_scales
+from fdtasil.probes.scales import (
+    Scales,
+    all_but,
+    measure_actions,
+    measure_following,
+    measure_scales,
+)
 from fdtasil.probes.spread import Spread
 from fdtasil.rollouts.spaces import Spaces, flat_layout
 from fdtasil.run.checkpoints import Collected
@@ -53,7 +59,7 @@ class Lesson:
         states = collected.dataset.demonstrations
         first = states.observations[states.round == states.round.min()][:256]
         view = View.of(student_obs, first) if before is None else before.view
-        moved = ~np.isin(np.arange(len(view.seen)), list(held))
+        moved = all_but(held, len(view.seen))
         hidden = ~view.seen & moved
         view = replace(view, seen=view.seen & moved)
         scales = measure_scales(states.observations, view.seen)

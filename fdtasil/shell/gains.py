@@ -11,7 +11,7 @@ from fdtasil.checks import check_count, check_suffix
 from fdtasil.experts.examination import look_closely
 from fdtasil.files.storage import write_bytes
 from fdtasil.probes.gains import Gains, gains
-from fdtasil.probes.scales import least_steps, measure_scales
+from fdtasil.probes.scales import measure_scales
 from fdtasil.rollouts.environments import EnvironmentPool
 from fdtasil.rollouts.wanted import import_module_of
 from fdtasil.shell.call import opened, wanted
@@ -68,9 +68,8 @@ def command(
         assert asked is not None, "who acted was opened"
         visited = looked.own.observations[looked.own.valid]
         scales = measure_scales(visited)
-        scale = np.maximum(scales.units, least_steps(visited))
         chosen = looked.own.spread(min(states, len(visited)))
-        found = gains(asked, chosen, scale=scale, seed=seed)
+        found = gains(asked, chosen, scale=scales.units_beside(visited), seed=seed)
         found = replace(found, still=tuple(np.flatnonzero(~scales.live).tolist()))
         found = _without(found, list(pool.spaces.observations.held))
     print(found)

@@ -16,7 +16,7 @@ from fdtasil.experts.sb3.network import (
     Rescale,
     build_network,
 )
-from fdtasil.experts.sb3.observations import read_observed
+from fdtasil.experts.sb3.observations import Observed, read_observed
 from fdtasil.experts.sb3.recipes import Recipe, check_policy, find_recipe, read_activation
 from fdtasil.experts.sb3.recurrent import (
     RECURRENT,
@@ -145,7 +145,7 @@ def read_agent(
             module.memory_size,
         )
     recipe = find_recipe(archive.record, str(path))
-    network, squashed, bounds = _read_network(archive, recipe, (n, m), given, trust)
+    network, squashed, bounds = _read_network(archive, recipe, observed, m, given, trust)
     _check_bounds(bounds, squashed, str(path))
     parts: list[nn.Module] = [network]
     if not choice_sizes(archive.record):
@@ -178,17 +178,22 @@ def _find(path: str | Path) -> Path:
 
 
 def _read_network(
-    archive: Archive, recipe: Recipe, sizes: tuple[int, int], given: Bounds | None, trust: Trust
+    archive: Archive,
+    recipe: Recipe,
+    observed: Observed,
+    actions: int,
+    given: Bounds | None,
+    trust: Trust,
 ) -> tuple[nn.Module, bool, Bounds]:
     """Return the network, whether its actions are to be rescaled, and the bounds.
 
     Trust in statistics, which always need it, is no reason to run code of a zip that needs none.
     """
+    sizes = observed.size, actions
     try:
         return _rebuilt(archive, recipe, sizes, given)
     except ExpertError as refusal:
-        untrusted = choice_sizes(archive.record) or read_observed(archive.record, "").parts
-        if untrusted and refusal.next_step == TRUST:
+        if (observed.parts or choice_sizes(archive.record)) and refusal.next_step == TRUST:
             raise ExpertError(refusal.found, refusal.expected, ITSELF) from refusal
         if trust is None or refusal.next_step != TRUST:
             raise

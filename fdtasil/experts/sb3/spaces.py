@@ -76,9 +76,9 @@ def read_size(record: Mapping[str, Any], name: str, source: str) -> int:
         sizes = shape if isinstance(shape, list) else []
         # A stack of frames is laid in a row; of three dimensions, it may be an image.
         usual = 0 < len(sizes) < (2 if name == "action_space" else 3)
-        if usual and all(isinstance(size, int) and 0 < size <= LARGEST for size in sizes):
-            if math.prod(sizes) <= LARGEST:
-                return math.prod(sizes)
+        usual = usual and all(isinstance(size, int) and size > 0 for size in sizes)
+        if usual and math.prod(sizes) <= LARGEST:
+            return math.prod(sizes)
     raise ExpertError(
         shown(f"{source} has the {name} {kind} of shape {shape} and dtype {dtype}"),
         "a Box of floats with one dimension"
