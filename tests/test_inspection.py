@@ -3,9 +3,11 @@
 import html
 import json
 
+import gymnasium
 import numpy as np
 import pytest
 from conftest import GAIN, TOY, mlp_onnx
+from gymnasium.spaces import Box, Dict, Discrete
 
 import fdtasil
 from fdtasil.errors import ExpertError
@@ -43,6 +45,28 @@ def test_what_is_no_expert_is_shown_with_its_problem(expert, named):
     assert next(one.name for one in found.findings if one.problem) == named
     assert f"{named:20}FAILED: " in str(found)
     assert str(found.problem) in [one["problem"] for one in found.to_json()["findings"]]
+
+
+def test_nothing_that_can_be_moved_is_no_calibration():
+    """A mode, and a number that stands still: `distill` clones plainly there."""
+
+    class Modes(gymnasium.Env):
+        observation_space = Dict({"mode": Discrete(2), "still": Box(0, 9, (1,), np.float32)})
+        action_space = Box(-1, 1, (1,), np.float32)
+
+        def reset(self, *, seed=None, options=None):
+            super().reset(seed=seed)
+            return self._observed(), {}
+
+        def step(self, action):
+            return self._observed(), 1.0 + float(action[0]), False, False, {}
+
+        def _observed(self):
+            return {"mode": self.np_random.integers(2), "still": np.full(1, 3, np.float32)}
+
+    law = lambda seen: seen["mode"].reshape(-1, 1) * 0.5  # noqa: E731
+    found = fdtasil.inspect(law, Modes, episodes=2, horizon=20)
+    assert (found.problem, found.calibration) == (None, None)
 
 
 @pytest.mark.slow

@@ -104,9 +104,9 @@ def _calibrated(looked: Looked, pool: EnvironmentPool, seed: int) -> Calibration
         return None
     visited, random = looked.own.observations[looked.own.valid], generator(seed, "calibration")
     moved = all_but(pool.spaces.observations.held, visited.shape[1])
-    if not moved.any():
-        return None
     scales, radius = measure_scales(visited, moved), PRESETS["standard"].radius
+    if not (scales.live & scales.seen).any():  # `distill` would clone plainly
+        return None
     low, high, choices = pool.boxes.low, pool.boxes.high, pool.spaces.actions.choices
     units = action_units(low, high, looked.own.actions[looked.own.valid], choices)
     return calibrate(looked.expert, visited, scales, random, radius, units=units)
