@@ -14,6 +14,10 @@ from fdtasil.rollouts.spaces import to_numpy
 
 __all__ = ["from_arrays"]
 
+_AFTER_THE_LAST = (
+    "leave out the observation after each episode's last action, which no action answers: "
+    "observations[:-1]"
+)
 _CHOICES = 20  # of how many there is a choice at most, where actions are whole numbers
 
 
@@ -59,7 +63,9 @@ def from_arrays(
         raise SettingError(
             f"observations of shape {rows.shape} and actions of shape {labels.shape}",
             "(N, n) and (N, m), a row for each state",
-            "reshape them; episodes stand one behind the other",
+            _AFTER_THE_LAST
+            if rows.ndim == labels.ndim == 2 and len(rows) == len(labels) + 1
+            else "reshape them; episodes stand one behind the other",
         )
     count, m = labels.shape
     none = np.full(m, np.inf)
@@ -110,10 +116,12 @@ def _joined(
     widths = [{shape[-1] for shape in of if shape} for of in (shapes, theirs)]
     lengths = [shape[0] for shape in shapes if shape]
     if not all(good) or lengths != [s[0] for s in theirs if s] or max(map(len, widths)) > 1:
+        one_more = bool(lengths) and lengths == [s[0] + 1 for s in theirs if s]
+        look = "look at the first episode whose arrays are of other lengths or widths"
         raise SettingError(
             f"episodes of observations of shapes {shown(shapes)}, of actions {shown(theirs)}",
             "lists of as many arrays, (T, n) and (T, m), T at least 1 and the same in both",
-            "look at the first episode whose arrays are of other lengths or widths",
+            _AFTER_THE_LAST if one_more else look,
         )
     return np.concatenate(parts), np.concatenate(labels), np.cumsum(lengths).tolist()
 

@@ -80,7 +80,7 @@ class Origin:
     options: str | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Expert:
     """A black box that answers observations with actions.
 
@@ -129,6 +129,13 @@ class Expert:
     silence: Silence = field(default_factory=Silence)
     seconds: dict[str, float] = field(default_factory=dict)
     origin: Origin = field(default_factory=Origin)
+
+    def __repr__(self) -> str:
+        """Return its sizes and what it was asked, not the fields."""
+        n, m = (str(size or "?") for size in (self.observation_size, self.action_size))
+        memory = f" with a memory of {self.memory.size}" if self.memory else ""
+        asked = f"{sum(self.queries.values()):,} queries"
+        return f"Expert({self.name}: {n} observations -> {m} actions{memory}, {asked})"
 
     def ask(self, observations: np.ndarray, purpose: Purpose) -> np.ndarray:
         """Answer a batch and count its rows.

@@ -31,7 +31,7 @@ from fdtasil.experts.sb3.randomness import randomness_kept
 from fdtasil.experts.sb3.recurrent import RecurrentNetwork
 from fdtasil.experts.sb3.trust import Trust
 from fdtasil.experts.silence import Silence
-from fdtasil.experts.sizes import size_hint
+from fdtasil.experts.sizes import AS_A_STUDENT, size_hint
 from fdtasil.experts.structure import in_spaces
 from fdtasil.experts.trial import vouch_for
 from fdtasil.experts.workers import BATCH, Workers, check_workers, with_processes, with_threads
@@ -218,17 +218,22 @@ def sized(expert: Expert, observation_size: int | None, action_size: int | None)
     expected = (observation_size, action_size)
     for role, ours, theirs in zip(("observations", "actions"), said, expected, strict=True):
         if ours is not None and theirs is not None and ours != theirs:
-            step = "check the environment's version and options, and the output that was chosen"
             raise ExpertError(
                 f"{expert.name} has {ours} {role}, the environment has {theirs}",
                 "an expert of this environment",
-                size_hint(ours, theirs) if role == "observations" else step,
+                _step(expert, role, ours, theirs),
             )
     return dataclasses.replace(
         expert,
         observation_size=expert.observation_size or expected[0],
         action_size=said[1] or expected[1],
     )
+
+
+def _step(expert: Expert, role: str, ours: int, theirs: int) -> str:
+    if role == "actions":
+        return "check the environment's version and options, and the output that was chosen"
+    return size_hint(ours, theirs) if expert.origin.columns is None else AS_A_STUDENT
 
 
 def _kind_of(source: object) -> "Kind":

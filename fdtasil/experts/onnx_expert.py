@@ -15,7 +15,7 @@ from fdtasil.errors import ExpertError, FdtasilError, SettingError, shown
 from fdtasil.experts.cost import stored_numbers
 from fdtasil.experts.expert import Expert, Hints, Origin
 from fdtasil.experts.memory import Memory, stateless
-from fdtasil.experts.sizes import size_hint
+from fdtasil.experts.sizes import AS_A_STUDENT, size_hint
 from fdtasil.experts.trial import try_out
 from fdtasil.experts.twin import torch_twin
 from fdtasil.files.onnx.binding import Choices, Given, bind
@@ -72,12 +72,13 @@ def open_onnx(source: str | Path, hints: Hints) -> Expert:
         return _recurrent(source, model, digest, pairs, hints)
     model = _bound(model, hints, wanted, path)
     data = model.SerializeToString()
-    n = _declared_size(model)
+    n, past = _declared_size(model), _history_of(model)
     if n and wanted not in (None, n):
         raise ExpertError(
-            f"{path} wants {n} observations, the environment gives {wanted}",
+            f"{path} wants {n} observations, the environment gives {wanted}"
+            + (f": it is a student that sees the last {past}" if past > 1 else ""),
             "an expert of this environment",
-            size_hint(n, wanted),
+            AS_A_STUDENT if past > 1 else size_hint(n, wanted),
         )
     choices = len(hints.spaces.actions.choices) if hints.spaces else 0
     call = (data, str(path), wanted, hints.action_size, hints.output, choices)
@@ -147,7 +148,11 @@ def said_history(source: object) -> int:
             "the function itself",
             "pass student_obs=, or a function of whole observations that calls both",
         )
-    text = texts.get(HISTORY, "1")
+    return _history_of(model)
+
+
+def _history_of(model: "onnx.ModelProto") -> int:
+    text = next((entry.value for entry in model.metadata_props if entry.key == HISTORY), "1")
     return int(text) if text.isascii() and text.isdigit() and 0 < int(text) < _LONGEST else 1
 
 

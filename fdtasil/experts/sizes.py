@@ -1,6 +1,12 @@
 """Why an expert has more or fewer numbers than its environment."""
 
-__all__ = ["size_hint"]
+__all__ = ["AS_A_STUDENT", "size_hint"]
+
+AS_A_STUDENT = (
+    "judge it with fdtasil.evaluate, which knows what it sees; as an expert, pass a function of "
+    "whole observations that asks it"
+)
+"""Next step where the file of a student that sees less, or more, is in the place of an expert."""
 
 # What an environment gives in one version or with one option, and in the other.
 _VERSIONS = {

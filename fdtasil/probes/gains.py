@@ -28,7 +28,7 @@ _FAR = 0.01  # of the scale: who does not change at all within it has no derivat
 _UNSURE = 0.3  # error, as a share of the Jacobian, above which nothing is left of it
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, repr=False)
 class Gains:
     """Jacobians of an expert, K(x) of a controller.
 
@@ -66,6 +66,11 @@ class Gains:
         if size == 0:
             return 0.0 if error == 0 else float("inf")
         return error / size
+
+    def __repr__(self) -> str:
+        """Return a line, not the arrays."""
+        (count, m, n), error = self.jacobian.shape, f"{self.relative_error:.1%}"
+        return f"Gains({count:,} states, Jacobians of {m} x {n}, error {error} of their norm)"
 
     def __str__(self) -> str:
         sizes = np.sqrt(np.nanmean((self.jacobian * self.scale) ** 2, axis=0))

@@ -91,13 +91,29 @@ class Evaluation:
         """Read what `to_json` returned."""
         return from_plain(cls, fields)
 
+    def interval_text(self) -> str:
+        """Return the interval of the normalised return in words, or why there is none."""
+        if self.ci95 is not None:
+            return interval_text(self.ci95)
+        return f"n/a: {self._missing()}"
+
+    def _missing(self) -> str:
+        if 2 * self.physics_resets > self.episodes:
+            return "the simulator put itself back in most episodes"
+        zero = "random actions" if self.reference_return else "a return of 0"
+        if self.normalized_return is None:
+            return f"the expert is no better than {zero}"
+        if self.episodes < 2:
+            return "of a single pair"
+        return f"the expert is not surely better than {zero}"
+
     def _repr_html_(self) -> str:
         return rows_html(evaluation_rows(self))
 
     def __str__(self) -> str:
         expert = f"{self.expert_return:10.1f}   survival {self.expert_survival:.2f}"
         student = f"{self.student_return:10.1f}   survival {self.survival:.2f}"
-        share = f"{score_text(self.normalized_return):>10}   95 % {interval_text(self.ci95)}"
+        share = f"{score_text(self.normalized_return):>10}   95 % {self.interval_text()}"
         kept = "".join(
             f"\n  {name:17} violated at {theirs:.2%} of the expert's steps, {ours:.2%} of the "
             "student's"
@@ -143,7 +159,7 @@ def evaluation_rows(found: Evaluation) -> list[tuple[str, str]]:
     rows = [
         (
             "normalised return",
-            f"{score_text(found.normalized_return)} {interval_text(found.ci95)}",
+            f"{score_text(found.normalized_return)} {found.interval_text()}",
         ),
         ("return", f"{found.student_return:,.1f}, the expert's {found.expert_return:,.1f}"),
         ("survival", f"{found.survival:.2f}, the expert's {found.expert_survival:.2f}"),

@@ -22,7 +22,7 @@ from fdtasil.files.names import inside
 from fdtasil.files.plain import as_kind
 from fdtasil.files.reading import read_plain
 from fdtasil.files.run_format import CHECKPOINTS, COMMAND, check_free, stamped, unstamped
-from fdtasil.files.storage import is_written, remove_file, remove_if_empty, write_bytes
+from fdtasil.files.storage import remove_file, remove_if_empty, write_bytes
 from fdtasil.results.distilled import Distilled
 from fdtasil.results.evaluation import Evaluation, interval_text, missing_text, score_text
 from fdtasil.results.size import size_text
@@ -163,9 +163,6 @@ def _remembering(arguments: dict[str, Any], folder: Path) -> Iterator[None]:
     if os.path.exists(checkpoints):  # of another run, which is refused in a moment
         yield
         return
-    if is_written(folder):
-        told = f"{arguments['out']} holds a finished run, which this one replaces when it ends"
-        print(told, file=sys.stderr)
     plain = {k: str(v) if isinstance(v, Path) else v for k, v in arguments.items()}
     alone = not folder.parent.exists()
     with locked(folder):  # another run's arguments stay its own
@@ -212,6 +209,12 @@ def _remembered(folder: Path) -> dict[str, Any]:
     """
     name = shlex.quote(str(folder))
     again = f"repeat the arguments: fdtasil distill EXPERT ENV ... --resume {name}"
+    if not folder.is_dir():
+        raise SettingError(
+            f"--resume {name}, which is no folder",
+            "one that `fdtasil distill --out` has begun",
+            "look for its name, or begin a run: fdtasil distill EXPERT ENV --out NAME",
+        )
     try:
         path = inside(folder, COMMAND)
         arguments = unstamped(read_plain(path, _LIMIT, follow=False), path, older=True)

@@ -48,6 +48,11 @@ class History:
         self._student, self._history = student, history
         self._window = Window(history, self.observation_size, m)
 
+    def __repr__(self) -> str:
+        m = self._student.action_size
+        seen = f"{self._history} observations of {self.observation_size}"
+        return f"History({seen} -> {m} actions)"
+
     def reset(self) -> None:
         """Forget what was seen, before an episode begins."""
         self._window.clear()

@@ -15,6 +15,7 @@ from fdtasil.files.onnx.graph import add_module
 from fdtasil.files.onnx.nodes import Nodes
 from fdtasil.files.tensors import tensors_from_bytes, tensors_to_bytes
 from fdtasil.probes.scales import Scales
+from fdtasil.rollouts.environments import bounds_text
 from fdtasil.rollouts.spaces import Mismatch, Spaces
 from fdtasil.student.architectures import Architecture, Mlp, architecture_of, describe
 from fdtasil.student.asking import as_numbers, check_choosing
@@ -97,6 +98,11 @@ class Student(nn.Module):
     def action_size(self) -> int:
         """m, the length of an action."""
         return len(self.low)
+
+    def extra_repr(self) -> str:
+        """Return what the sizes of the network do not tell."""
+        ends = bounds_text(self.low.numpy(force=True), self.high.numpy(force=True))
+        return f"{self.observation_size} observations -> {self.action_size} actions, {ends}"
 
     def forward(self, observations: Tensor) -> Tensor:
         """(B, n) raw observations -> (B, m) actions in environment units, inside the bounds."""
