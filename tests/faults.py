@@ -381,6 +381,7 @@ FAULTS = {
         360: "zips of agents on dictionaries",
         361: "gains at a single state of few coordinates",
         362: "a curved view, or second derivatives that nobody gives, found after all was asked",
+        363: "actions of a log that were cut off at bounds that nobody says",
     },
 }
 

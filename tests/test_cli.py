@@ -541,3 +541,9 @@ def test_two_folders_and_swapped_arguments(inside, tmp_path):
     done = inside("distill", TOY, expert, cwd=tmp_path)
     assert done.returncode == 1
     assert "in the place of the environment" in done.stderr
+
+
+def test_a_folder_to_go_on_with_that_is_none_is_named(inside, tmp_path):
+    nowhere = inside("distill", "--resume", tmp_path / "none")
+    assert nowhere.returncode == 2
+    assert "none, which is no folder" in nowhere.stderr

@@ -206,6 +206,7 @@ def states(expert, tmp_path_factory):
 @pytest.mark.filterwarnings("ignore:.* and another one that has not ended")
 @pytest.mark.parametrize("every", [41, pytest.param(1, marks=pytest.mark.torture)])
 @pytest.mark.parametrize("forever", [False, True])
+@pytest.mark.filterwarnings("ignore:.*holds a finished run, which this one replaces")
 def test_any_write_may_fail(every, forever, expert, states, tmp_path, monkeypatch, figure):
     """The n-th write fails for every n: the old run or the new one, never anything between."""
     monkeypatch.setattr(runfolder, "CHECKPOINT_SECONDS", 0.0)

@@ -679,6 +679,32 @@ def test_bounds_that_arrays_lack_are_the_environments(arrays, linear):
         fdtasil.distill(linear, TOY, dataset=wrong, **run)
 
 
+@pytest.mark.fault(363)
+def test_actions_that_were_cut_off_at_bounds_that_nobody_says_are_warned_of():
+    states = np.random.default_rng(0).standard_normal((200, 5))
+    cut = np.stack([np.clip(3 * states[:, 0], -1, 1), np.tanh(states[:, 1])], axis=1)
+    run = {"dataset": fdtasil.from_arrays(states, cut), "probes": 0, **SMALL}
+    with pytest.warns(FdtasilWarning, match=r"1 of 2 actions .* \(action 0 at -1 and 1\)"):
+        free = fdtasil.distill(**run)
+    assert not np.isfinite(free.student.low).any()
+    fdtasil.distill(None, TOY, horizon=5, evaluation_episodes=2, **run)  # its bounds are known
+    repeated = np.tile(states[:20], (5, 1))  # each state of an episode is met in all of them
+    for seen, quiet in (
+        (states, 3 * states[:, :2]),
+        (states, np.sign(states[:, :2])),  # a switch
+        (repeated, repeated[:, :2]),
+    ):
+        fdtasil.distill(**run | {"dataset": fdtasil.from_arrays(seen, quiet)})
+
+
+@pytest.mark.parametrize("listed", [False, True])
+def test_observations_after_the_last_action_are_named(arrays, listed):
+    states, actions = arrays
+    pair = ([states], [actions[:-1]]) if listed else (states, actions[:-1])
+    with pytest.raises(SettingError, match="leave out the observation after each episode's last"):
+        fdtasil.from_arrays(*pair)
+
+
 def test_an_array_for_each_episode(arrays):
     states, actions = arrays
     parts = [states[:15], states[15:]], [actions[:15], actions[15:]]

@@ -67,12 +67,14 @@ def test_few_pairs_some_without_a_return_have_no_interval(ours):
     found = judged(np.array([1.0, 1.0, 0.0]), np.array(ours, float))
     assert found.normalized_return == pytest.approx(sum(ours) / 2)
     assert found.ci95 is None
-    assert "95 % n/a" in str(found)
+    assert "95 % n/a: the expert is not surely better than a return of 0" in str(found)
 
 
 def test_a_single_pair_has_no_interval():
     found = judged(np.array([2.0]), np.array([1.0]))
     assert (found.normalized_return, found.ci95) == (0.5, None)
+    assert "95 % n/a: of a single pair" in str(found)
+    assert "0.500 n/a: of a single pair" in found._repr_html_()
 
 
 def test_what_went_wrong_is_said_of_whom():
@@ -96,6 +98,8 @@ def test_zero_is_random_actions_unless_most_of_the_experts_returns_are_positive(
     with pytest.warns(FdtasilWarning, match="return 0 is not above 0, that of random actions"):
         nothing = judged(np.zeros(4), np.zeros(4))
     assert nothing.normalized_return is nothing.ci95 is None
+    assert "n/a: the expert is no better than a return of 0" in str(nothing)
+    assert "the simulator put itself back" in str(replace(nothing, physics_resets=3))
 
 
 def test_the_interval_of_a_task_of_costs_is_that_of_the_gain_over_random_actions():

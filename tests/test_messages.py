@@ -3,9 +3,11 @@
 import gymnasium
 import numpy as np
 import pytest
+import torch
 from conftest import GAIN, QUICK, TOY
 
 import fdtasil
+from fdtasil import Mlp, Student
 from fdtasil.errors import EnvironmentFault, FdtasilError
 from fdtasil.probes.answers import ask_moved
 
@@ -101,3 +103,29 @@ def test_a_dictionary_in_the_place_of_the_numbers_of_a_history(quick):
     with pytest.raises(FdtasilError, match="an observation that is a dict"):
         fdtasil.History(result.student, 2).predict({"speed": np.zeros(5)})
     fdtasil.History(result.student, 2).predict((0.1, 0.2, 0.3, 0.4, 0.5))
+
+
+@pytest.mark.parametrize("seen", [{"student_obs": [0, 1]}, {"history": 2}])
+def test_the_file_of_a_student_that_sees_otherwise_is_no_expert(seen, tmp_path):
+    """`evaluate` knows what it sees; whoever takes an expert is told so."""
+    law = lambda rows: rows @ GAIN.T  # noqa: E731
+    result = fdtasil.distill(law, TOY, 0, **QUICK, **seen)
+    result.export(tmp_path / "student.onnx")
+    problem = fdtasil.inspect(tmp_path / "student.onnx", TOY, episodes=1, horizon=5).problem
+    assert "judge it with fdtasil.evaluate, which knows what it sees" in str(problem)
+    found = fdtasil.evaluate(tmp_path / "student.onnx", law, TOY, episodes=2, horizon=5)
+    assert found.normalized_return is not None
+
+
+def test_what_is_shown_at_a_prompt_is_short():
+    expert = fdtasil.load_expert(lambda rows: rows @ GAIN.T)
+    states = np.random.default_rng(0).standard_normal((4, 5))
+    found = fdtasil.gains(expert, states)
+    student = Student(Mlp(4), np.zeros(5), np.ones(5), -np.ones(2), np.ones(2), torch.Generator())
+    told = f"? observations -> ? actions, {sum(expert.queries.values()):,} queries)"
+    assert repr(expert).startswith("Expert(")
+    assert repr(expert).endswith(told)
+    assert repr(found).startswith("Gains(4 states, Jacobians of 2 x 5, error 0.")
+    assert "5 observations -> 2 actions, -1 to 1" in repr(student)
+    past = Student(Mlp(4), np.zeros(8), np.ones(8), -np.ones(1), np.ones(1), torch.Generator())
+    assert repr(fdtasil.History(past, 3)) == "History(3 observations of 2 -> 1 actions)"

@@ -305,7 +305,10 @@ def test_a_finished_run_is_not_handed_out_for_the_one_that_begins_in_its_place(
 
     with monkeypatch.context() as patch:
         patch.setattr("fdtasil.run.folder.write_folder", full)
-        with pytest.raises(StorageError, match="no space"):
+        with (
+            pytest.raises(StorageError, match="no space"),
+            pytest.warns(FdtasilWarning, match="holds a finished run, which this one replaces"),
+        ):
             fdtasil.distill(expert, TOY, 0, seed=7, out=tmp_path / "run", **run)
     assert (tmp_path / "run" / "checkpoints" / "config.json").exists()
     again = fdtasil.distill(expert, TOY, 0, seed=7, resume=tmp_path / "run", **run)

@@ -34,6 +34,7 @@ __all__ = [
     "in_form",
     "load_dataset",
     "warn_of_bounds",
+    "warn_of_cut_actions",
 ]
 
 _VERSION = 2
@@ -268,6 +269,32 @@ def warn_of_bounds(dataset: Dataset) -> None:
             "the environment that the actions are for"
         )
 
+
+def warn_of_cut_actions(dataset: Dataset) -> None:
+    """Warn of actions without bounds that were cut off at some: a student would go beyond."""
+    states, free = dataset.demonstrations, ~np.isfinite(dataset.low) & ~np.isfinite(dataset.high)
+    if not (free & _often_at_its_ends(states.actions)).any():
+        return
+    # Where every episode is the same, each action is met again in all of them.
+    _, one_each = np.unique(states.observations, axis=0, return_index=True)
+    actions = states.actions[one_each]
+    cut = free & _often_at_its_ends(actions)
+    for j in np.flatnonzero(cut)[:1]:
+        warn(
+            f"{int(cut.sum())} of {len(cut)} actions have no bounds, and seem to be cut off "
+            f"(action {j} at {actions[:, j].min():g} and {actions[:, j].max():g}): a student goes "
+            "beyond; pass low= and high= to from_arrays, or the environment to distill"
+        )
+
+
+def _often_at_its_ends(actions: np.ndarray) -> np.ndarray:
+    """Return (m,) whether each action meets both its ends again and again, and is between them."""
+    met = [(actions == end).sum(axis=0) for end in (actions.min(axis=0), actions.max(axis=0))]
+    between = len(actions) - sum(met)  # few of them: choices, or a switch
+    return np.minimum(np.minimum(*met), between) >= max(_MET, _MET_SHARE * len(actions))
+
+
+_MET, _MET_SHARE = 3, 0.01  # times, and of the states, that the end of a cut action is met
 
 _ROUNDED = 1e-5  # of an action's larger bound: what float32 and files round
 

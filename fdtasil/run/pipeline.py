@@ -9,7 +9,12 @@ import torch
 
 from fdtasil.checks import check_flag, check_path
 from fdtasil.compute import pick_device, torch_settings
-from fdtasil.demonstrations.dataset import Dataset, DatasetLike, load_dataset
+from fdtasil.demonstrations.dataset import (
+    Dataset,
+    DatasetLike,
+    load_dataset,
+    warn_of_cut_actions,
+)
 from fdtasil.demonstrations.past import showing
 from fdtasil.demonstrations.trainers import Trainer
 from fdtasil.errors import SettingError, heard_warnings
@@ -218,7 +223,9 @@ def distill(
         student_obs = named(student_obs, layout)
         student_obs = visible(student_obs, subject.observation_size, subject.remembered)
         if given is not None:
-            if subject.pool is not None:
+            if subject.pool is None:
+                warn_of_cut_actions(given)
+            else:
                 given = bounded(given, subject.pool)
             given = showing(given, history, subject.actions)
         arguments = replace(arguments, given=given, student_obs=student_obs)
