@@ -250,7 +250,7 @@ def _unreadable(folder: Path, problem: object) -> StorageError:
 
 def is_written(folder: Path) -> bool:
     """Return whether a folder has a manifest: everything else was there before it."""
-    return _path_of(folder, MANIFEST).exists()
+    return os.path.exists(_path_of(folder, MANIFEST))
 
 
 def make_folder(folder: Path) -> None:

@@ -85,8 +85,6 @@ def open_run_folder(
                 "an empty folder, or a finished run (which is replaced)",
                 f"{going_on}, or choose another folder",
             )
-        elif folder.finished:
-            warn(f"{path} holds a finished run, which this one replaces when it ends")
         try:
             yield folder
         except BaseException as error:
