@@ -333,7 +333,7 @@ def _path_of(folder: Path, name: str) -> Path:
     """Return where a file of a folder is, which is not yet in place if a move was cut short."""
     coming = inside(folder, COMING)
     # Without its manifest, what is coming does not count; the manifest is the last to be moved.
-    if (coming / MANIFEST).exists() and inside(coming, name).exists():
+    if os.path.exists(coming / MANIFEST) and os.path.exists(inside(coming, name)):
         return coming / name
     return inside(folder, name)
 
