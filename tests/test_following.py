@@ -1,7 +1,10 @@
 """What a student does not see, and what follows from what it sees: probes move both."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
+import torch
 from conftest import QUICK
 from gymnasium.spaces import Box
 from toy_environments import Integrator
@@ -108,3 +111,24 @@ def test_what_does_not_follow(states, seen, hidden):
 def test_what_is_seen_or_held_never_follows():
     found = following(rows(), [0, 1, 2, 3], [4])
     assert not found[:, :4].any()
+
+
+class OfPart(torch.nn.Module):
+    """The law of what is seen: a copy of the first position stands for the hidden one, or 0."""
+
+    def __init__(self, weight):
+        super().__init__()
+        self.weight = weight
+
+    def forward(self, seen):
+        first = self.weight * seen[:, 0]
+        both = 2 * (seen[:, 0] + seen[:, 1])
+        return torch.tanh(-torch.stack([first + seen[:, 2], 0.2 * both + seen[:, 3]], dim=1))
+
+
+@pytest.mark.parametrize(("weight", "least", "most"), [(1.0, 0.0, 1e-3), (0.0, 0.1, 1.0)])
+def test_a_student_that_hides_a_copy_is_looked_at_as_it_was_taught(weight, least, most):
+    result = replace(distilled(0), student=OfPart(weight))
+    brief = {"episodes": 2, "horizon": 40, "steps": 5, "progress": False}
+    error = fdtasil.diagnose(result, law, Copied, **brief).fidelity.error
+    assert least <= error <= most

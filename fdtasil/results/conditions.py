@@ -147,7 +147,7 @@ def errors_of(
     drawn /= np.linalg.norm(drawn, axis=2, keepdims=True)
 
     def on_both_sides(directions: np.ndarray, step: float) -> np.ndarray:
-        moves = step * scales.units * np.stack([directions, -directions])
+        moves = step * scales.with_following(scales.units * np.stack([directions, -directions]))
         return np.stack([_answers(student, expert, units, states, side) for side in moves])
 
     around = _Around(

@@ -77,7 +77,7 @@ def fidelity_of(
     count, n = states.shape
     normal = random.standard_normal((count, _DIRECTIONS, n)) * live
     unit = normal / np.linalg.norm(normal, axis=2, keepdims=True) * live.sum() ** 0.5
-    steps = unit * np.where(live, scales.deviation, 0.0)
+    steps = scales.with_following(unit * np.where(live, scales.deviation, 0.0))
     answers = expert(states)
     heard = ~has_none(answers)
     states, steps, theirs = states[heard], steps[heard], answers[heard].astype(np.float64)

@@ -15,7 +15,13 @@ from fdtasil.experts.examination import examine
 from fdtasil.experts.expert import Expert
 from fdtasil.experts.load import ExpertLike, expert_in
 from fdtasil.probes.calibration import calibrate
-from fdtasil.probes.scales import Scales, action_units, all_but, measure_scales
+from fdtasil.probes.scales import (
+    Scales,
+    action_units,
+    all_but,
+    measure_following,
+    measure_scales,
+)
 from fdtasil.progress import Progress
 from fdtasil.results.conditions import conditions_of, errors_of
 from fdtasil.results.diagnosis import Diagnosis
@@ -37,6 +43,7 @@ from fdtasil.run.judging import (
     finished_run,
     judged_in,
     judged_through,
+    seen_by,
     warn_of_another_environment,
     warn_of_another_expert,
 )
@@ -66,7 +73,8 @@ def diagnose(
     """Measure how well a student's derivatives are its expert's, and what the expert forgives.
 
     Nothing is trained, and the student may be anybody's: a result or the folder of a run, an ONNX
-    file, a function. Of one that sees several observations, the present one is moved alone.
+    file, a function. Of one that sees several observations, the present one is moved alone; of
+    one that sees a part, what follows linearly from that part is moved along.
     The expert is asked some eleven thousand times beside its episodes, and 48 times more for each
     coordinate where its loop follows a law.
 
@@ -117,12 +125,28 @@ def diagnose(
         act = acting(judged, student_obs, visited, m, purpose="check")
         warn_of_another_environment(student, pool)
         warn_of_another_expert(student, asked)
-        scales = measure_scales(visited)
-        scales = replace(scales, live=scales.live & np.isin(np.arange(visited.shape[1]), present))
+        view = seen_by(judged, student_obs, visited)
+        scales = _moved(visited, view.seen, present, pool.spaces.observations.held)
         units = action_units(pool.boxes.low, pool.boxes.high, own.actions[own.valid])
         pair = _Pair(pool, asked, act, scales, units, starts, seed, history > 1)
         pair.check_movable()
         return pair.diagnose(own, min(followed, length))
+
+
+def _moved(
+    visited: np.ndarray, seen: np.ndarray, present: np.ndarray, held: Sequence[int]
+) -> Scales:
+    """Return the scales of (N, n) states; what the student does not see, and follows, is led.
+
+    What it does not see and follows from nothing is moved too: its expert answers to that.
+    """
+    n = visited.shape[1]
+    free = np.isin(np.arange(n), present) & all_but(held, n)
+    scales = measure_scales(visited)
+    scales = replace(scales, live=scales.live & np.isin(np.arange(n), present))
+    following = measure_following(visited, replace(scales, seen=seen & free), ~seen & free)
+    led = replace(scales, following=following)
+    return replace(led, seen=all_but(led.followers, n))
 
 
 def _check_numbers(pool: EnvironmentPool) -> None:

@@ -37,6 +37,7 @@ __all__ = [
     "finished_run",
     "judged_in",
     "judged_through",
+    "seen_by",
     "warn_of_another_environment",
     "warn_of_another_expert",
 ]
@@ -168,6 +169,22 @@ def acting(
     Raises:
         SettingError: If its file says that it sees something else.
     """
+    view = seen_by(judged, student_obs, states, remembered=remembered)
+    return view.policy(sized(judged, view.size, action_size).policy(purpose))
+
+
+def seen_by(
+    judged: Expert,
+    student_obs: StudentObservation | None,
+    states: np.ndarray,
+    *,
+    remembered: int = 0,
+) -> View:
+    """Return what a policy that is judged sees; the arguments of `acting`.
+
+    Raises:
+        SettingError: If its file says that it sees something else.
+    """
     says = judged.origin.columns
     seen = says if student_obs is None else student_obs
     few = states[:256]
@@ -178,7 +195,7 @@ def acting(
             f"{list(says)}, as the file says itself",
             "leave student_obs= out",
         )
-    return view.policy(sized(judged, view.size, action_size).policy(purpose))
+    return view
 
 
 def check_history(history: object, student_obs: object) -> int:
