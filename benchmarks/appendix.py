@@ -57,13 +57,12 @@ def arguments(cell: Cell) -> dict[str, Any]:
 
 
 def draw(rows: Sequence[Row]) -> dict[str, bytes]:
-    """Two tables of what has all seeds, what was run so far, and a picture of what is whole."""
+    """Two tables and a picture of what has all seeds, and what was run so far."""
     scores = scores_of(rows, DRAWN[:1], len(SEEDS))
     text = f"{scores_text(scores, DRAWN, PAIRS)}\n" if scores else ""
     text += f"What was run so far (seeds), with its cost:\n\n{_so_far(rows)}"
     files = {"appendix.md": text.encode()}
-    whole = scores_of(rows, DRAWN, len(SEEDS))
-    return files | ({"appendix.png": draw_scores(whole, DRAWN, label)} if whole else {})
+    return files | ({"appendix.png": draw_scores(scores, DRAWN, label)} if scores else {})
 
 
 def _so_far(rows: Sequence[Row]) -> str:
