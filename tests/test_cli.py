@@ -364,8 +364,10 @@ def test_a_run_goes_on_as_it_was_begun_and_a_failed_call_changes_nothing(expert,
     other = inside("distill", "--resume", tmp_path / "run", "--seed", "7")
     assert other.returncode == 2
     assert "--seed beside --resume" in other.stderr
-    replacing = inside("distill", expert, TOY, *QUICK, "--seed", 1, "--out", tmp_path / "run")
+    one = [*QUICK[:-1], 1]  # evaluation episode
+    replacing = inside("distill", expert, TOY, *one, "--seed", 1, "--out", tmp_path / "run")
     assert "which this one replaces" in replacing.stderr
+    assert "95 % interval n/a: of a single pair" in replacing.stdout
 
 
 def test_a_run_is_resumed_with_nothing_but_its_folder(expert, inside, tmp_path, monkeypatch):

@@ -91,7 +91,7 @@ class Evaluation:
         """Read what `to_json` returned."""
         return from_plain(cls, fields)
 
-    def interval_text(self) -> str:
+    def interval_in_words(self) -> str:
         """Return the interval of the normalised return in words, or why there is none."""
         if self.ci95 is not None:
             return interval_text(self.ci95)
@@ -113,7 +113,7 @@ class Evaluation:
     def __str__(self) -> str:
         expert = f"{self.expert_return:10.1f}   survival {self.expert_survival:.2f}"
         student = f"{self.student_return:10.1f}   survival {self.survival:.2f}"
-        share = f"{score_text(self.normalized_return):>10}   95 % {self.interval_text()}"
+        share = f"{score_text(self.normalized_return):>10}   95 % {self.interval_in_words()}"
         kept = "".join(
             f"\n  {name:17} violated at {theirs:.2%} of the expert's steps, {ours:.2%} of the "
             "student's"
@@ -159,7 +159,7 @@ def evaluation_rows(found: Evaluation) -> list[tuple[str, str]]:
     rows = [
         (
             "normalised return",
-            f"{score_text(found.normalized_return)} {found.interval_text()}",
+            f"{score_text(found.normalized_return)} {found.interval_in_words()}",
         ),
         ("return", f"{found.student_return:,.1f}, the expert's {found.expert_return:,.1f}"),
         ("survival", f"{found.survival:.2f}, the expert's {found.expert_survival:.2f}"),

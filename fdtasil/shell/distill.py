@@ -271,6 +271,8 @@ def _side_by_side(result: Distilled, cloning: Evaluation | None) -> str:
                 f"{name:15}{e.student_return:10.1f}{score_text(e.normalized_return):>12}"
                 f"{interval_text(e.ci95):>18}{e.survival:10.2f}"
             )
+    if ours.ci95 is None:
+        lines.append(f"95 % interval {ours.interval_in_words()}")
     return "\n".join(lines)
 
 
