@@ -9,8 +9,10 @@ import onnx
 import pytest
 import torch
 from conftest import GAIN, QUICK, TOY, mlp_onnx
+from gymnasium.spaces import Box
 from onnx import TensorProto, helper, numpy_helper
 from sb3_agents import make_agent, save_agent
+from toy_environments import Integrator
 
 import fdtasil
 from fdtasil.errors import EnvironmentFault, ExpertError, FdtasilWarning, SettingError
@@ -549,3 +551,36 @@ def test_masks_that_nobody_hands_over_are_warned_of():
     with pytest.warns(fdtasil.FdtasilWarning, match="takes action_masks"):
         expert = fdtasil.load_expert(Masked(), 5, 2)
     assert not expert.ask(np.ones((2, 5)), "check").any()
+
+
+class Regressor:
+    """Answers as scikit-learn, XGBoost and LightGBM do where there is one target."""
+
+    def predict(self, rows):
+        return np.clip(rows @ GAIN.T[:, 0], -1, 1)
+
+
+class OneForce(Integrator):
+    """Which takes one force along both axes."""
+
+    def __init__(self):
+        super().__init__()
+        self.action_space = Box(-1, 1, (1,), np.float32)
+
+    def step(self, action):
+        return super().step(np.repeat(action, 2))
+
+
+@pytest.mark.parametrize("kind", [Regressor, lambda: Regressor().predict])
+def test_an_answer_of_one_action_needs_no_axis(kind):
+    result = fdtasil.distill(kind(), OneForce, 2, **QUICK)
+    states = result.demonstrations.observations
+    assert result.demonstrations.actions[:, 0] == pytest.approx(
+        Regressor().predict(states), abs=1e-5
+    )
+    assert fdtasil.gains(kind(), states[:4]).jacobian.shape == (4, 1, 5)
+
+
+def test_a_function_of_the_whole_batch_is_no_answer_of_one_action():
+    with pytest.raises(ExpertError, match="observations with shape"):
+        fdtasil.distill(lambda rows: rows.sum(axis=0), OneForce, 2, **QUICK)

@@ -35,7 +35,7 @@ def one_state(row):
         (asked([None]), "a row of NaN"),
         (asked(np.zeros(4)), "one row of actions for each row"),
         (asked([]), "one row of actions for each row"),
-        (lambda: fdtasil.load_expert(sums, 5, 1).ask(STATES, "act"), r"found\[:, None\]"),
+        (lambda: fdtasil.load_expert(sums, 5, 2).ask(STATES, "act"), "one row of actions"),
         (lambda: fdtasil.load_expert(one_state, 5, 2).ask(STATES, "act"), "for row in rows"),
         (lambda: fdtasil.load_expert("mpc.py"), r"fdtasil.distill\(function"),
         (lambda: fdtasil.load_expert("mpc:plan"), r"fdtasil.distill\(function"),

@@ -133,6 +133,8 @@ class Batches:
         except Exception as error:
             flat = self.parts is None
             raise _Raised.of(self.name, len(rows), expected, error, self._given, flat) from error
+        if answer.shape == (len(rows),) and self.action_size in (None, 1):
+            answer = answer[:, None]  # of one action, as regressors and tree ensembles answer
         if answer.shape == (len(rows), 1) and self.action_size and np.isnan(answer).all():
             answer = np.repeat(answer, self.action_size, axis=1)  # nulls in the place of rows
         if answer.ndim != 2 or len(answer) != len(rows) or not self._has_action_size(answer):
@@ -141,7 +143,7 @@ class Batches:
             raise ExpertError(
                 f"{self.name} answered {asked} observations with shape {answer.shape}{given}",
                 expected,
-                _advice(answer, len(rows), self.action_size),
+                _advice(answer),
             )
         infinite = np.asarray(np.isinf(answer).any(axis=1))
         if infinite.any():
@@ -171,15 +173,10 @@ class Batches:
         return self.action_size is None or answer.shape[1] == self.action_size
 
 
-def _advice(answer: np.ndarray, rows: int, action_size: int | None) -> str:
+def _advice(answer: np.ndarray) -> str:
     """Return what to do about answers of another shape."""
     if answer.ndim < 2 and answer.size and np.isnan(answer).all():
         return "in the place of None, return a row of NaN for each row that has no answer"
-    if answer.shape == (rows,) and action_size in (None, 1):
-        return (
-            "of one action, return found[:, None], a row for each row of observations; of an "
-            "object, pass lambda rows: model.predict(rows)[:, None]"
-        )
     return "return one row of actions for each row of observations"
 
 

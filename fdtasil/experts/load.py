@@ -48,7 +48,10 @@ class Predictor(Protocol):
     """What stable-baselines3's agents, and many others, look like."""
 
     def predict(self, observation: np.ndarray, /) -> Any:
-        """Answer (B, n) observations with (B, m) actions, or a tuple that begins with them."""
+        """Answer (B, n) observations with (B, m) actions, or a tuple that begins with them.
+
+        Of one action, (B,) will do.
+        """
         ...
 
 
