@@ -532,7 +532,8 @@ def test_ends_of_episodes_as_others_have_them(arrays):
     "change",
     [
         {"observations": np.zeros((3, 5))},
-        {"actions": np.zeros(40)},
+        {"actions": np.zeros(39)},
+        {"actions": np.zeros((40, 2, 1))},
         {"observations": np.full((40, 5), np.nan)},
         {"observations": [["a"] * 5] * 40},
         {"episode_ends": [0, 40]},
@@ -703,6 +704,18 @@ def test_observations_after_the_last_action_are_named(arrays, listed):
     pair = ([states], [actions[:-1]]) if listed else (states, actions[:-1])
     with pytest.raises(SettingError, match="leave out the observation after each episode's last"):
         fdtasil.from_arrays(*pair)
+
+
+def test_numbers_of_one_action_need_no_axis(arrays):
+    states, action = arrays[0], arrays[1][:, 0]
+    whole = fdtasil.from_arrays(states, action[:, None], episode_ends=[15, 40])
+    parts = [states[:15], states[15:]], [action[:15], action[15:]]
+    assert (
+        fdtasil.from_arrays(states, action, episode_ends=[15, 40]).to_bytes() == whole.to_bytes()
+    )
+    assert fdtasil.from_arrays(*parts).to_bytes() == whole.to_bytes()
+    with pytest.warns(FdtasilWarning, match=r"np\.eye\(3\)\[np\.ravel\(actions\)"):
+        fdtasil.from_arrays(states, np.arange(40) % 3)
 
 
 def test_an_array_for_each_episode(arrays):

@@ -37,7 +37,8 @@ def from_arrays(
 
     Args:
         observations: (N, n) states, or a list of them, (T, n) for each episode.
-        actions: (N, m) what the expert did there, in the environment's units; or such a list.
+        actions: (N, m) what the expert did there, in the environment's units; or such a list. Of
+            one action, (N,) will do.
         episode_ends: (N,) booleans, true at the last state of each episode, or the number of
             states up to each end, as Minari and D4RL have them. Left out, all are of one.
         low: (m,) lower action bounds, or one number; left out, there are none, or those of the
@@ -57,7 +58,7 @@ def from_arrays(
     """
     if isinstance(observations, list | tuple) and observations and np.ndim(observations[0]) == 2:
         observations, actions, episode_ends = _joined(observations, actions, episode_ends)
-    wide, labels = _numbers("observations", observations), _numbers("actions", actions)
+    wide, labels = _numbers("observations", observations), _columns(_numbers("actions", actions))
     rows = np.ascontiguousarray(wide, np.float32)
     if rows.ndim != 2 or labels.ndim != 2 or len(rows) != len(labels) or not len(rows):
         raise SettingError(
@@ -95,7 +96,7 @@ def _warn_of_choices(actions: np.ndarray) -> None:
     if single and least >= 0 and least + 1 < count <= _CHOICES:
         warn(
             f"actions of {actions.dtype} are learnt as numbers; if they are choices, from 0 on, "
-            f"write scores: np.eye({count})[actions[:, 0].astype(int)] - 1 / {count}"
+            f"write scores: np.eye({count})[np.ravel(actions).astype(int)] - 1 / {count}"
         )
 
 
@@ -110,7 +111,8 @@ def _joined(
             "leave episode_ends= out",
         )
     parts = [to_numpy(part) for part in observations]
-    labels = [to_numpy(part) for part in actions] if isinstance(actions, list | tuple) else []
+    listed = isinstance(actions, list | tuple)
+    labels = [_columns(to_numpy(part)) for part in actions] if listed else []
     shapes, theirs = [part.shape for part in parts], [part.shape for part in labels]
     good = [len(shape) == 2 and shape[0] > 0 for shape in shapes + theirs]
     widths = [{shape[-1] for shape in of if shape} for of in (shapes, theirs)]
@@ -124,6 +126,11 @@ def _joined(
             _AFTER_THE_LAST if one_more else look,
         )
     return np.concatenate(parts), np.concatenate(labels), np.cumsum(lengths).tolist()
+
+
+def _columns(actions: np.ndarray) -> np.ndarray:
+    """Return actions as a matrix, where they are numbers of a single one."""
+    return actions[:, None] if actions.ndim == 1 else actions
 
 
 def _numbers(name: str, given: Any) -> np.ndarray:
