@@ -2,6 +2,7 @@
 
 import gymnasium
 import numpy as np
+import onnx
 import pytest
 import torch
 from conftest import GAIN, QUICK, TOY
@@ -37,6 +38,12 @@ def one_state(row):
         (asked([]), "one row of actions for each row"),
         (lambda: fdtasil.load_expert(sums, 5, 2).ask(STATES, "act"), "one row of actions"),
         (lambda: fdtasil.load_expert(one_state, 5, 2).ask(STATES, "act"), "for row in rows"),
+        (
+            lambda: fdtasil.load_expert(Mlp(4).build(3, 1, torch.Generator()).state_dict()),
+            "module",
+        ),
+        (lambda: fdtasil.load_expert(onnx.ModelProto()), r"onnx.save\(model"),
+        (lambda: fdtasil.load_expert(b"onnx"), "write them to a file"),
         (lambda: fdtasil.load_expert("mpc.py"), r"fdtasil.distill\(function"),
         (lambda: fdtasil.load_expert("mpc:plan"), r"fdtasil.distill\(function"),
         (lambda: fdtasil.load_expert("127.0.0.1:8000/act"), "begins with http://"),

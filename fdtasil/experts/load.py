@@ -254,6 +254,8 @@ def _how_to_pass(source: object) -> str:
     """Return what makes an expert of an object that is none; no property of it is asked."""
     if isinstance(getattr(source, "__dict__", {}).get("student"), torch.nn.Module):
         return "of a result, pass its student: result.student"
+    if (advice := _BY_TYPE.get(type(source).__name__)) is not None:
+        return advice
     for name in _OTHER_NAMES:
         if callable(getattr(type(source), name, None)):
             return f"pass its method, expert.{name}, if that takes (B, n) and returns (B, m)"
@@ -262,6 +264,14 @@ def _how_to_pass(source: object) -> str:
         "predict(observations, state, episode_start) -> (actions, state)"
     )
 
+
+_BY_TYPE = {
+    "InferenceSession": "pass the path of its file, or lambda rows: session.run(None, {name: "
+    "rows})[0], with the name of its input",
+    "ModelProto": 'write it first: onnx.save(model, "expert.onnx"), and pass that path',
+    "OrderedDict": "of weights alone, load them into their module, and pass that",
+    "bytes": "write them to a file, and pass its path",
+}
 
 _OTHER_NAMES = ("act", "get_action", "select_action", "compute_action", "compute_actions")
 """What other libraries call `predict`."""
