@@ -88,13 +88,17 @@ class FdtasilWarning(UserWarning):
     """Something that did not stop the work, and that the result should be read with."""
 
 
-def warn(message: str) -> None:
+def warn(message: str, *, of_result: bool = True) -> None:
     """Warn with the line of the caller's own code that led here, however deep that is.
 
-    It is shown each time, where the caller's filters let it, and heard by `heard_warnings`.
+    It is shown each time, where the caller's filters let it.
+
+    Args:
+        message: What is said.
+        of_result: Whether a result should be read with it: `heard_warnings` hears it then.
     """
     message = printable(message)
-    for heard in _HEARD.get():
+    for heard in _HEARD.get() if of_result else ():
         heard.append(message)
     frame = sys._getframe(1)
     while frame.f_back is not None and frame.f_code.co_filename.startswith(_OURS):

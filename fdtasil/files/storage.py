@@ -250,7 +250,7 @@ def _unreadable(folder: Path, problem: object) -> StorageError:
 
 def is_written(folder: Path) -> bool:
     """Return whether a folder has a manifest: everything else was there before it."""
-    return os.path.exists(_path_of(folder, MANIFEST))
+    return _path_of(folder, MANIFEST).exists()
 
 
 def make_folder(folder: Path) -> None:
@@ -333,7 +333,7 @@ def _path_of(folder: Path, name: str) -> Path:
     """Return where a file of a folder is, which is not yet in place if a move was cut short."""
     coming = inside(folder, COMING)
     # Without its manifest, what is coming does not count; the manifest is the last to be moved.
-    if os.path.exists(coming / MANIFEST) and os.path.exists(inside(coming, name)):
+    if (coming / MANIFEST).exists() and inside(coming, name).exists():
         return coming / name
     return inside(folder, name)
 

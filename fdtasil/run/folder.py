@@ -85,6 +85,9 @@ def open_run_folder(
                 "an empty folder, or a finished run (which is replaced)",
                 f"{going_on}, or choose another folder",
             )
+        elif folder.finished:
+            told = f"{path} holds a finished run, which this one replaces when it ends"
+            warn(told, of_result=False)
         try:
             yield folder
         except BaseException as error:

@@ -17,13 +17,12 @@ from fdtasil.demonstrations.dataset import (
 )
 from fdtasil.demonstrations.past import showing
 from fdtasil.demonstrations.trainers import Trainer
-from fdtasil.errors import SettingError, heard_warnings, warn
+from fdtasil.errors import SettingError, heard_warnings
 from fdtasil.experts.examination import check_first, examine
 from fdtasil.experts.expert import Expert
 from fdtasil.experts.gate import GATE_STATES, compare_again
 from fdtasil.experts.load import ExpertLike
 from fdtasil.experts.silence import Silence
-from fdtasil.files.storage import is_written
 from fdtasil.probes.source import Probes
 from fdtasil.probes.spread import SpreadLike
 from fdtasil.progress import Progress
@@ -291,14 +290,8 @@ def _folder_of(out: str | Path | None, resume: str | Path | None) -> Path | None
         found = f"out={str(out)!r} beside resume={str(resume)!r}"
         raise SettingError(found, "one folder", "leave out= out: a resumed run stays in its own")
     name, path = ("out", out) if resume is None else ("resume", resume)
-    if path is None:
-        return None
     # Absolute from the beginning: an environment may change the working folder.
-    folder = check_path(name, path).absolute()
-    if resume is None and is_written(folder):
-        # Here, where no run hears it: it is no property of the result.
-        warn(f"{out} holds a finished run, which this one replaces when it ends")
-    return folder
+    return None if path is None else check_path(name, path).absolute()
 
 
 def _collecting(run: Configuration, subject: Subject, bars: Progress) -> Collecting | None:
